@@ -1,0 +1,63 @@
+"""Physically simulatable Gaussian assets.
+
+Public names are imported on first use, so `import gdpro_sim` is light and starts no backend.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "Asset": "gdpro_sim.asset",
+    "BoundGaussians": "gdpro_sim.binding",
+    "Cameras": "gdpro_sim.cameras",
+    "Gaussians": "gdpro_sim.gaussians",
+    "GdproError": "gdpro_sim.errors",
+    "Scene": "gdpro_sim.simulation.scene",
+    "import_mesh": "gdpro_sim.asset",
+    "load_scene": "gdpro_sim.simulation.scene",
+    "rasterization": "gdpro_sim.splatting",
+    "record": "gdpro_sim.io.record",
+    "simulate": "gdpro_sim.simulation.run",
+}
+
+if TYPE_CHECKING:
+    from gdpro_sim.asset import Asset, import_mesh
+    from gdpro_sim.binding import BoundGaussians
+    from gdpro_sim.cameras import Cameras
+    from gdpro_sim.errors import GdproError
+    from gdpro_sim.gaussians import Gaussians
+    from gdpro_sim.io.record import record
+    from gdpro_sim.simulation.run import simulate
+    from gdpro_sim.simulation.scene import Scene, load_scene
+    from gdpro_sim.splatting import rasterization
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        value = getattr(importlib.import_module(_PUBLIC[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'gdpro_sim' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_PUBLIC])
+
+
+__all__ = [
+    "Asset",
+    "BoundGaussians",
+    "Cameras",
+    "Gaussians",
+    "GdproError",
+    "Scene",
+    "import_mesh",
+    "load_scene",
+    "rasterization",
+    "record",
+    "simulate",
+]

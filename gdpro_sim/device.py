@@ -1,0 +1,119 @@
+"""Device choice, and Warp launches spread over CPU cores.
+
+Warp runs a CPU launch serially on the calling thread but releases the GIL while it does, so several
+launches over disjoint index ranges, one per thread, use several cores. Kernels launched through
+`launch_chunked` take `start: int` as their first argument and work on index `start + wp.tid()`; each index
+must write memory no other index writes (plain Warp atomics are not atomic on the CPU).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+from gdpro_sim.errors import DeviceError
+
+wp.config.quiet = True
+
+_threads: int | None = None
+_pool: ThreadPoolExecutor | None = None
+
+
+def resolve_device(device: str = "auto") -> str:
+    """Return the Warp name of a device: `"cpu"` or `"cuda:N"`.
+
+    `"auto"` is the first CUDA device where there is one, else the CPU. Raises `DeviceError` when the
+    named device does not exist on this machine; never falls back to another.
+    """
+    wp.init()
+    cuda = [d.alias for d in wp.get_cuda_devices()]
+    if device == "auto":
+        return cuda[0] if cuda else "cpu"
+    if device == "cpu":
+        return "cpu"
+    name = "cuda:0" if device == "cuda" else device
+    if name in cuda:
+        return name
+    available = ", ".join(["cpu", *cuda])
+    raise DeviceError(f"device {device!r} is not available on this machine; choose one of: auto, {available}")
+
+
+def thread_count() -> int:
+    """Number of CPU threads used for one launch (`GDPRO_THREADS`, default: the cores this process may use)."""
+    global _threads
+    if _threads is None:
+        text = os.environ.get("GDPRO_THREADS", "")
+        if text:
+            if not text.isdigit() or int(text) < 1:
+                raise DeviceError(f"GDPRO_THREADS must be a whole number >= 1, got {text!r}")
+            _threads = int(text)
+        elif hasattr(os, "sched_getaffinity"):
+            _threads = len(os.sched_getaffinity(0))
+        else:
+            _threads = os.cpu_count() or 1
+    return _threads
+
+
+def set_thread_count(count: int) -> None:
+    """Set the number of CPU threads used for one launch; `count` >= 1."""
+    global _threads, _pool
+    if count < 1:
+        raise DeviceError(f"thread count must be >= 1, got {count}")
+    _threads = count
+    if _pool is not None:
+        _pool.shutdown()
+        _pool = None
+
+
+def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1) -> None:
+    """Call `function(begin, end)` over contiguous ranges that cover `range(count)`, one range per thread.
+
+    `minimum` is the fewest indices worth a thread of their own. The first exception is raised again here.
+    """
+    global _pool
+    if count <= 0:
+        return
+    chunks = min(thread_count(), max(1, count // max(1, minimum)))
+    if chunks == 1:
+        function(0, count)
+        return
+    if _pool is None:
+        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="gdpro")
+    bounds = [count * i // chunks for i in range(chunks + 1)]
+    futures = [_pool.submit(function, bounds[i], bounds[i + 1]) for i in range(1, chunks)]
+    try:
+        function(0, bounds[1])
+    finally:
+        for future in futures:
+            future.result()
+
+
+def launch_chunked(
+    kernel: wp.Kernel,
+    count: int,
+    inputs: Sequence[Any],
+    outputs: Sequence[Any] = (),
+    *,
+    device: str,
+    minimum: int = 1024,
+) -> None:
+    """Launch `kernel(start, *inputs, *outputs)` over `count` indices: one launch on CUDA, one per core on the CPU."""
+    if count <= 0:
+        return
+    if device != "cpu":
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device)
+        return
+    if thread_count() > 1 and count >= 2 * minimum:
+        wp.load_module(kernel.module, device="cpu")
+
+    def launch(begin: int, end: int) -> None:
+        wp.launch(kernel, dim=end - begin, inputs=[begin, *inputs], outputs=list(outputs), device="cpu")
+
+    run_chunks(launch, count, minimum)
+
+
+__all__ = ["launch_chunked", "resolve_device", "run_chunks", "set_thread_count", "thread_count"]

@@ -1,0 +1,135 @@
+"""Compiled scenes: `Model` is constant, `State` changes, `Solver` turns one state into the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from gdpro_sim.binding import BoundGaussians
+from gdpro_sim.meshing.tetmesh import Embedding
+
+
+@dataclass(frozen=True)
+class Body:
+    """One deformable body inside a `Model`, in world space.
+
+    name:           unique within the scene
+    gaussians:      bound Gaussians at the body's own size, in the asset's frame
+    surface:        [V, 3] float32 m, rest surface vertices placed in the world
+    embedding:      surface vertices in this body's tets (tet ids count from the body's first tet)
+    vertex_range:   (begin, end) into Model.vertices
+    tet_range:      (begin, end) into Model.tets
+    """
+
+    name: str
+    gaussians: BoundGaussians
+    surface: np.ndarray
+    embedding: Embedding
+    vertex_range: tuple[int, int]
+    tet_range: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor: the half-space z >= height is free; friction belongs to the bodies."""
+
+    height: float = 0.0
+
+
+@dataclass(frozen=True)
+class FemSettings:
+    """How the FEM solver steps.
+
+    substeps:          implicit steps per `step(dt)`; raised by the solver where a step fails
+    newton_iterations: most projected-Newton iterations in one substep
+    newton_tolerance:  stop when the Newton step's largest vertex move is below this times dt, m/s
+    cg_tolerance:      relative residual of the inner conjugate gradients
+    contact_stiffness: ground penalty stiffness as a multiple of the stiffness that the body's own
+                       elasticity and inertia set
+    """
+
+    substeps: int = 2
+    newton_iterations: int = 8
+    newton_tolerance: float = 1e-3
+    cg_tolerance: float = 1e-2
+    contact_stiffness: float = 1.0
+
+
+@dataclass(frozen=True)
+class Model:
+    """A compiled scene: everything constant. Arrays are float32 / int32 NumPy, SI units, world space.
+
+    vertices:    [P, 3] undeformed positions of all bodies' tet vertices
+    velocities:  [P, 3] initial velocities
+    tets:        [T, 4] positive volumes
+    fill:        [T] fraction of material in each element
+    young, poisson, density, rayleigh_mass, rayleigh_stiffness: [T]
+    friction:    [P] Coulomb coefficient of each vertex against the ground
+    pinned:      [P] bool, vertices that never move
+    """
+
+    bodies: tuple[Body, ...]
+    vertices: np.ndarray
+    velocities: np.ndarray
+    tets: np.ndarray
+    fill: np.ndarray
+    young: np.ndarray
+    poisson: np.ndarray
+    density: np.ndarray
+    rayleigh_mass: np.ndarray
+    rayleigh_stiffness: np.ndarray
+    friction: np.ndarray
+    pinned: np.ndarray
+    gravity: tuple[float, float, float]
+    ground: Ground | None
+    fem: FemSettings
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What a solver reports about its last `step`. Energies in J, momentum in kg m/s, SI throughout."""
+
+    time: float
+    kinetic_energy: float
+    elastic_energy: float
+    gravity_energy: float
+    contact_energy: float
+    momentum: tuple[float, float, float]
+    angular_momentum: tuple[float, float, float]
+    contacts: int
+    max_penetration: float
+    min_volume_ratio: float
+    substeps: int
+    newton_iterations: int
+    cg_iterations: int
+    converged: bool
+    residual: float
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """State -> State. `step` advances by `dt` seconds, choosing its own substeps."""
+
+    def reset(self) -> None:
+        """Back to the model's initial state."""
+
+    def step(self, dt: float) -> None:
+        """Advance by `dt` seconds. Raises SolverError, leaving the state as it was, if it cannot."""
+
+    def surface_positions(self, body: int) -> np.ndarray:
+        """Deformed surface vertices of body number `body`, [V, 3] float32 m, world."""
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Everything needed to continue to the same bytes."""
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from a `state_dict`."""
+
+    def diagnostics(self) -> Diagnostics:
+        """Figures of the last step (of the initial state before any)."""
+
+
+__all__ = ["Body", "Diagnostics", "FemSettings", "Ground", "Model", "Solver"]

@@ -1,0 +1,1 @@
+"""Ready scenes (YAML), runnable by name: `gdpro simulate NAME`."""
