@@ -8,12 +8,18 @@ harmonics.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
+import math
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
+import warp as wp
 
+from gdpro_sim.device import launch_chunked
 from gdpro_sim.errors import AssetError
-from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.gaussians import SH_C0, Gaussians
+from gdpro_sim.kernels.binding import follow_triangles
 
 
 @dataclass(frozen=True)
@@ -42,3 +48,138 @@ class BoundGaussians:
 
     def __len__(self) -> int:
         return int(self.face_ids.shape[0])
+
+    @property
+    def device(self) -> torch.device:
+        return self.vertices.device
+
+    def to(self, device: str | torch.device) -> BoundGaussians:
+        """The same Gaussians with every tensor on `device`."""
+        return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    def scaled(self, factor: float) -> BoundGaussians:
+        """Uniformly resized by `factor` > 0, thickness included."""
+        if not (math.isfinite(factor) and factor > 0.0):
+            raise AssetError(f"scale must be a finite number > 0, got {factor}")
+        return replace(self, vertices=self.vertices * factor, log_scales=self.log_scales + math.log(factor))
+
+    def gaussians(self, vertices: torch.Tensor | None = None, *, rotate_sh: bool = True) -> Gaussians:
+        """Gaussians carried by `vertices` [V, 3] float32 m (default: the rest vertices).
+
+        The rest vertices give the rest Gaussians back bit for bit; a rigid motion moves every Gaussian rigidly.
+        With `rotate_sh` False the colours keep their rest directions (cheaper, and exact at degree 0).
+        Raises AssetError for a wrong shape or dtype. Not differentiable.
+        """
+        moved = self.vertices if vertices is None else vertices
+        if moved.shape != self.vertices.shape or moved.dtype != torch.float32:
+            raise AssetError(
+                f"vertices must be float32 {list(self.vertices.shape)} like the asset's mesh, "
+                f"got {moved.dtype} {list(moved.shape)}"
+            )
+        n = len(self)
+        device = self.device
+        moved = moved.detach().to(device).contiguous()
+        means = torch.empty((n, 3), dtype=torch.float32, device=device)
+        quats = torch.empty((n, 4), dtype=torch.float32, device=device)
+        scales = torch.empty((n, 3), dtype=torch.float32, device=device)
+        degree = math.isqrt(self.sh.shape[1]) - 1 if rotate_sh else 0
+        sh = torch.empty_like(self.sh) if degree > 0 else self.sh
+        if n > 0:
+            name = "cpu" if device.type == "cpu" else str(wp.device_from_torch(device))
+            directions, inverse = _sh_rotation_tables(degree, name)
+            rest_sh = wp.from_torch(self.sh.detach().contiguous(), dtype=wp.vec3)
+            launch_chunked(
+                follow_triangles,
+                n,
+                [
+                    wp.from_torch(self.vertices.detach().contiguous(), dtype=wp.vec3),
+                    wp.from_torch(moved, dtype=wp.vec3),
+                    wp.from_torch(self.faces.contiguous()),
+                    wp.from_torch(self.face_ids.contiguous()),
+                    wp.from_torch(self.barycentrics.contiguous(), dtype=wp.vec3),
+                    wp.from_torch(self.rotations.detach().contiguous(), dtype=wp.vec2),
+                    wp.from_torch(self.log_scales.detach().contiguous(), dtype=wp.vec3),
+                    rest_sh,
+                    directions,
+                    inverse,
+                    degree,
+                ],
+                [
+                    wp.from_torch(means, dtype=wp.vec3),
+                    wp.from_torch(quats, dtype=wp.vec4),
+                    wp.from_torch(scales, dtype=wp.vec3),
+                    wp.from_torch(sh, dtype=wp.vec3) if degree > 0 else rest_sh,
+                ],
+                device=name,
+                minimum=4096,
+            )
+        return Gaussians(means, quats, scales, torch.sigmoid(self.opacity_logits.detach()), sh.detach())
+
+    def normals(self, vertices: torch.Tensor | None = None) -> torch.Tensor:
+        """Smooth unit normals at each Gaussian, [N, 3]: area-weighted vertex normals, interpolated."""
+        v = self.vertices if vertices is None else vertices.to(self.device)
+        per_vertex = vertex_normals(v, self.faces)
+        corners = per_vertex[self.faces.long()[self.face_ids.long()]]
+        return torch.nn.functional.normalize((corners * self.barycentrics[:, :, None]).sum(1), dim=1)
+
+
+def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    """Area-weighted unit vertex normals, [V, 3]; zero where a vertex has no area around it."""
+    corners = vertices[faces.long()]
+    face = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = torch.zeros_like(vertices)
+    for k in range(3):
+        total.index_add_(0, faces[:, k].long(), face)
+    return torch.nn.functional.normalize(total, dim=1)
+
+
+@functools.cache
+def _sh_rotation_tables(degree: int, device: str) -> tuple[wp.array, wp.array]:
+    """K = (degree + 1)^2 sampling directions and the inverse of the basis matrix there, [K, K]."""
+    count = (degree + 1) ** 2
+    generator = np.random.default_rng(7)
+    best = math.inf
+    for _ in range(300):
+        candidate = generator.normal(size=(count, 3))
+        candidate /= np.linalg.norm(candidate, axis=1, keepdims=True)
+        basis = sh_basis(degree, candidate)
+        condition = float(np.linalg.cond(basis))
+        if condition < best:
+            best, directions, inverse = condition, candidate, np.linalg.inv(basis)
+    return (
+        wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device),
+        wp.array(inverse.astype(np.float32), dtype=float, device=device),
+    )
+
+
+def sh_basis(degree: int, directions: np.ndarray) -> np.ndarray:
+    """Real spherical harmonics up to `degree` <= 3 at unit directions [M, 3]; [M, (degree + 1)^2] float64.
+
+    Order and signs of 3D Gaussian Splatting (Condon-Shortley phase).
+    """
+    x, y, z = np.asarray(directions, np.float64).T
+    xx, yy, zz = x * x, y * y, z * z
+    bands = [
+        [np.full_like(x, SH_C0)],
+        [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x],
+        [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2.0 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ],
+        [
+            -0.5900435899266435 * y * (3.0 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4.0 * zz - xx - yy),
+            0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+            -0.4570457994644658 * x * (4.0 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3.0 * yy),
+        ],
+    ]
+    return np.stack([values for band in bands[: degree + 1] for values in band], axis=1)
+
+
+__all__ = ["BoundGaussians", "sh_basis", "vertex_normals"]

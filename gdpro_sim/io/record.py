@@ -1,0 +1,368 @@
+"""Run a scene and write everything: asset, time-sampled USD, pictures, video, contact sheet, metrics.
+
+Every finished frame is kept in `.resume/` (solver state, surfaces, figures) until the run is complete, so a run
+that was stopped or killed continues where it was, to the same bytes.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import logging
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import gdpro_sim
+from gdpro_sim.asset import Asset
+from gdpro_sim.cameras import Cameras
+from gdpro_sim.errors import OutputError, RequestError
+from gdpro_sim.files import atomic_write, check_writable, sha256_of
+from gdpro_sim.io.images import read_png, spread, write_contact_sheet, write_png, write_video
+from gdpro_sim.io.preview import Studio, frame_camera, render
+from gdpro_sim.io.usd import SimulationWriter
+from gdpro_sim.simulation.compile import load_assets
+from gdpro_sim.simulation.frame import Frame
+from gdpro_sim.simulation.model import Diagnostics
+from gdpro_sim.simulation.run import Simulation
+from gdpro_sim.simulation.scene import Scene, load_scene
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int], None]
+"""Called with (phase, done, total); total 0 means the length is not known."""
+
+PHASES = ("solve", "resplat", "render", "write")
+
+
+@dataclass
+class Recording:
+    """Where the results lie and how long each phase took (seconds of this run)."""
+
+    output: Path
+    assets: list[Path]
+    simulation: Path
+    frames: Path
+    video: Path
+    contact_sheet: Path
+    metrics: Path
+    frame_count: int
+    resumed_frames: int
+    gaussians: int
+    tets: int
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for `--json`."""
+        return {k: ([str(p) for p in v] if k == "assets" else str(v) if isinstance(v, Path) else v) for k, v in asdict(self).items()}  # fmt: skip
+
+
+def record(
+    scene: Scene | str | Path,
+    output: str | Path,
+    *,
+    device: str = "auto",
+    fresh: bool = False,
+    on_progress: Progress | None = None,
+) -> Recording:
+    """Simulate `scene` and write its results into the folder `output`.
+
+    A run of the same scene that was interrupted there is continued, unless `fresh`. Raises RequestError (also
+    SceneError, MeshError, AssetError, DeviceError) before anything runs, SolverError or OutputError later; finished
+    frames stay on disk and the next call continues after them.
+    """
+    checked = scene if isinstance(scene, Scene) else load_scene(scene)
+    folder = Path(output)
+    _prepare_folder(folder)
+    store = _Store(folder / ".resume", _fingerprint(checked, device), fresh)
+    report = on_progress or (lambda phase, done, total: None)
+    seconds: dict[str, float] = {}
+
+    begin = time.perf_counter()
+    report("prepare", 0, 0)
+    names = [body.name for body in checked.bodies]
+    asset_paths = [folder / ("asset.usdc" if len(names) == 1 else f"asset_{name}.usdc") for name in names]
+    kept = dict(zip(names, asset_paths, strict=True)) if store.has_assets(asset_paths) else None
+    assets = load_assets(checked, stored=kept)
+    if kept is None:
+        _save_assets(assets, names, asset_paths)
+        store.assets_saved(asset_paths)
+    simulation = Simulation(checked, assets, device=device)
+    seconds["prepare"] = time.perf_counter() - begin
+
+    cameras, studio = _camera(checked, simulation), _studio(checked, simulation)
+    frames = folder / "frames"
+    frames.mkdir(exist_ok=True)
+    rows = _run(simulation, folder, store, cameras, studio, report)
+
+    begin = time.perf_counter()
+    pictures = [frames / _frame_name(i) for i in range(len(simulation))]
+    _remove_later_frames(frames, len(simulation))
+    report("video", 0, 0)
+    write_video(folder / "preview.mp4", (read_png(p) for p in pictures), checked.fps)
+    chosen = spread(len(pictures), 12)
+    labels = [f"t = {i / checked.fps:.2f} s" for i in chosen]
+    write_contact_sheet(folder / "contact_sheet.png", [read_png(pictures[i]) for i in chosen], labels)
+    _write_metrics(folder / "metrics.csv", rows)
+    report("video", 1, 1)
+    seconds.update({phase: sum(row[f"ms_{phase}"] for row in rows[store.resumed :]) / 1e3 for phase in PHASES})
+    seconds["video"] = time.perf_counter() - begin
+    store.finish()
+    return Recording(
+        output=folder,
+        assets=asset_paths,
+        simulation=folder / "simulation.usdc",
+        frames=frames,
+        video=folder / "preview.mp4",
+        contact_sheet=folder / "contact_sheet.png",
+        metrics=folder / "metrics.csv",
+        frame_count=len(simulation),
+        resumed_frames=store.resumed,
+        gaussians=sum(len(a.gaussians) for a in assets.values()),
+        tets=len(simulation.model.tets),
+        seconds={k: round(v, 3) for k, v in seconds.items()},
+    )
+
+
+def _run(
+    simulation: Simulation,
+    folder: Path,
+    store: _Store,
+    cameras: Cameras,
+    studio: Studio,
+    report: Progress,
+) -> list[dict[str, Any]]:
+    """Every frame: solve (or take it from an interrupted run), re-splat, draw, write."""
+    total = len(simulation)
+    rows: list[dict[str, Any]] = []
+    report("simulate", 0, total)
+    simulation.solver.reset()
+    with SimulationWriter(folder / "simulation.usdc", simulation.scene.fps, simulation.model.bodies) as writer:
+        for index in range(total):
+            stored = store.load(index)
+            if stored is None:
+                simulation.advance(index)
+                surfaces, diagnostics = simulation.surfaces(), simulation.solver.diagnostics()
+                solved = simulation.milliseconds["solve"]
+            else:
+                surfaces, diagnostics, solved, state = stored
+                simulation.solver.load_state_dict(state)
+            frame = simulation.frame(index, surfaces, diagnostics)
+
+            begin = time.perf_counter()
+            path = folder / "frames" / _frame_name(index)
+            picture = None
+            if stored is None or not path.exists():
+                picture = render(frame.gaussians(), cameras, normals=_normals(simulation, frame), studio=studio)[0]
+            drawn = time.perf_counter()
+            if picture is not None:
+                write_png(path, picture)
+            writer.add(frame)
+            if stored is None:
+                store.save(index, surfaces, diagnostics, solved, simulation.solver.state_dict())
+            written = time.perf_counter()
+            milliseconds = {
+                "solve": solved,
+                "resplat": simulation.milliseconds["resplat"],
+                "render": 1e3 * (drawn - begin),
+                "write": 1e3 * (written - drawn),
+            }
+            rows.append(_row(index, diagnostics, milliseconds))
+            report("simulate", index + 1, total)
+        report("usd", 0, 0)
+        begin = time.perf_counter()
+    rows[-1]["ms_write"] += 1e3 * (time.perf_counter() - begin)
+    return rows
+
+
+def _normals(simulation: Simulation, frame: Frame) -> torch.Tensor:
+    return torch.cat(
+        [
+            body.gaussians.normals(torch.from_numpy(moved.vertices))
+            for body, moved in zip(simulation.model.bodies, frame.bodies, strict=True)
+        ]
+    )
+
+
+def _frame_name(index: int) -> str:
+    return f"frame_{index:05d}.png"
+
+
+def _row(index: int, diagnostics: Diagnostics, milliseconds: dict[str, float]) -> dict[str, Any]:
+    """One line of metrics.csv: figures of the solver, then wall milliseconds per phase."""
+    row: dict[str, Any] = {"frame": index}
+    units = {
+        "time": "time_s", "kinetic_energy": "kinetic_energy_J", "elastic_energy": "elastic_energy_J",
+        "gravity_energy": "gravity_energy_J", "contact_energy": "contact_energy_J",
+        "max_penetration": "max_penetration_m",
+    }  # fmt: skip
+    for key, value in asdict(diagnostics).items():
+        if key in ("momentum", "angular_momentum"):
+            unit = "kg_m_per_s" if key == "momentum" else "kg_m2_per_s"
+            row.update({f"{key}_{axis}_{unit}": component for axis, component in zip("xyz", value, strict=True)})
+        else:
+            row[units.get(key, key)] = value
+    row.update({f"ms_{phase}": round(value, 3) for phase, value in milliseconds.items()})
+    return row
+
+
+def _write_metrics(path: Path, rows: list[dict[str, Any]]) -> None:
+    with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _remove_later_frames(frames: Path, count: int) -> None:
+    """Pictures past the end belong to an earlier, longer run of this folder."""
+    for old in frames.glob("frame_?????.png"):
+        if int(old.stem[-5:]) >= count:
+            old.unlink()
+
+
+def _camera(scene: Scene, simulation: Simulation) -> Cameras:
+    """The scene's camera; what it leaves out is chosen so that bodies, fall and landing fit the picture."""
+    surfaces = [body.surface for body in simulation.model.bodies]
+    low = np.min([s.min(axis=0) for s in surfaces], axis=0).astype(float)
+    high = np.max([s.max(axis=0) for s in surfaces], axis=0).astype(float)
+    if scene.ground is not None:
+        drop = max(0.0, float(low[2]) - scene.ground.height)
+        flight = min(scene.duration, (2.0 * drop / 9.81) ** 0.5)
+        for body in scene.bodies:
+            reach = flight * np.asarray(body.velocity)[:2]
+            low[:2] = np.minimum(low[:2], low[:2] + reach)
+            high[:2] = np.maximum(high[:2], high[:2] + reach)
+        low[2] = scene.ground.height
+        spread_out = 0.12 * (high[:2] - low[:2])
+        low[:2] -= spread_out
+        high[:2] += spread_out
+    camera = scene.camera
+    return frame_camera(low, high, **camera.model_dump())
+
+
+def _studio(scene: Scene, simulation: Simulation) -> Studio:
+    sizes = [float(np.ptp(body.surface, axis=0).max()) for body in simulation.model.bodies]
+    return Studio(
+        shading=scene.render.shading,
+        background=scene.render.background,
+        ground=None if scene.ground is None else scene.ground.height,
+        scale=max(sizes),
+    )
+
+
+def _save_assets(assets: dict[str, Asset], names: list[str], paths: list[Path]) -> None:
+    for name, path in zip(names, paths, strict=True):
+        assets[name].save(path)
+
+
+def _prepare_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise RequestError(f"output {folder} is a file; give a folder") from None
+    except OSError as error:
+        raise RequestError(f"output folder {folder} cannot be written: {error.strerror or error}") from None
+    check_writable(folder / "simulation.usdc")
+
+
+def _fingerprint(scene: Scene, device: str) -> str:
+    """Hash of everything that decides the frames: the scene, its asset files, the device, the version."""
+    digest = hashlib.sha256(f"{gdpro_sim.__version__}\n{device}\n{scene.model_dump_json()}".encode())
+    for body in scene.bodies:
+        for reference in (body.asset, body.texture):
+            if reference is not None:
+                path = scene.resolve(reference)
+                if path.is_file():
+                    digest.update(sha256_of(path).encode())
+    return digest.hexdigest()
+
+
+class _Store:
+    """Finished frames of a run that is not complete yet."""
+
+    def __init__(self, folder: Path, fingerprint: str, fresh: bool) -> None:
+        self.folder = folder
+        self.resumed = 0
+        self._open = True
+        marker = folder / "run.json"
+        known: dict[str, Any] = {}
+        try:
+            known = json.loads(marker.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            pass
+        self._assets: dict[str, str] = {}
+        if fresh or known.get("fingerprint") != fingerprint:
+            shutil.rmtree(folder, ignore_errors=True)
+        else:
+            self._assets = dict(known.get("assets", {}))
+        self._fingerprint = fingerprint
+        folder.mkdir(exist_ok=True)
+        self._write_marker()
+
+    def _write_marker(self) -> None:
+        with atomic_write(self.folder / "run.json") as temporary:
+            temporary.write_text(
+                json.dumps({"fingerprint": self._fingerprint, "assets": self._assets}), encoding="utf-8"
+            )
+
+    def has_assets(self, paths: list[Path]) -> bool:
+        """Whether the asset files are the ones this run wrote."""
+        return bool(self._assets) and all(
+            p.is_file() and self._assets.get(p.name) == sha256_of(p) for p in paths
+        )
+
+    def assets_saved(self, paths: list[Path]) -> None:
+        """Tets are not repeatable: frames of other assets are of no use."""
+        for old in self.folder.glob("frame_*.npz"):
+            old.unlink()
+        self._assets = {p.name: sha256_of(p) for p in paths}
+        self._write_marker()
+
+    def load(self, index: int) -> tuple[list[np.ndarray], Diagnostics, float, dict[str, np.ndarray]] | None:
+        """A finished frame: surfaces, diagnostics, milliseconds, solver state; None where it is missing."""
+        path = self.folder / f"frame_{index:05d}.npz"
+        if not self._open or not path.exists():
+            self._open = False
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                surfaces = [data[f"surface.{k}"] for k in range(sum(n.startswith("surface.") for n in data.files))]
+                state = {n.removeprefix("state."): data[n] for n in data.files if n.startswith("state.")}
+                figures = json.loads(str(data["figures"]))
+        except (OSError, ValueError, KeyError) as error:
+            logger.warning("%s cannot be read (%s); continuing from the frame before it", path, error)
+            self._open = False
+            return None
+        figures["diagnostics"] = {k: tuple(v) if isinstance(v, list) else v for k, v in figures["diagnostics"].items()}
+        self.resumed = index + 1
+        return surfaces, Diagnostics(**figures["diagnostics"]), figures["solve"], state
+
+    def save(
+        self,
+        index: int,
+        surfaces: list[np.ndarray],
+        diagnostics: Diagnostics,
+        solve: float,
+        state: dict[str, np.ndarray],
+    ) -> None:
+        figures = json.dumps({"diagnostics": asdict(diagnostics), "solve": solve})
+        arrays = {f"surface.{k}": s for k, s in enumerate(surfaces)} | {f"state.{k}": v for k, v in state.items()}
+        with atomic_write(self.folder / f"frame_{index:05d}.npz") as temporary:
+            np.savez(temporary, figures=np.array(figures), **arrays)  # type: ignore[arg-type]
+
+    def finish(self) -> None:
+        """The run is complete: nothing is left to resume."""
+        try:
+            shutil.rmtree(self.folder)
+        except OSError as error:
+            raise OutputError(f"{self.folder} cannot be removed: {error.strerror or error}") from None
+
+
+__all__ = ["Recording", "record"]

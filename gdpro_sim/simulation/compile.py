@@ -1,0 +1,179 @@
+"""Scene -> Model: load the assets, place them in the world, gather their tets into one set of arrays."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gdpro_sim.asset import Asset, import_mesh, is_asset, tetrahedralize_asset
+from gdpro_sim.errors import SceneError
+from gdpro_sim.materials import Material
+from gdpro_sim.simulation.model import Body, FemSettings, Ground, Model
+from gdpro_sim.simulation.scene import Scene, SceneBody
+
+logger = logging.getLogger(__name__)
+
+FALLBACK_MATERIAL = "jelly"
+
+
+def load_assets(
+    scene: Scene,
+    *,
+    stored: dict[str, Path] | None = None,
+    on_progress: Callable[[str], None] | None = None,
+) -> dict[str, Asset]:
+    """The asset of every body, with tets, by body name; meshes are imported.
+
+    `stored` names asset files of an earlier run of the same scene: they are taken as they are, because
+    tetrahedralization is not repeatable. Raises MeshError, AssetError or SceneError.
+    """
+    assets: dict[str, Asset] = {}
+    for body in scene.bodies:
+        if stored and body.name in stored:
+            assets[body.name] = Asset.load(stored[body.name])
+            continue
+        path = scene.resolve(body.asset)
+        if not path.exists():
+            raise SceneError(f"{scene.name}: bodies[{body.name}].asset: {path}: no such file")
+        if on_progress:
+            on_progress(f"preparing {body.name}")
+        if is_asset(path):
+            ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
+            if ignored:
+                raise SceneError(
+                    f"{scene.name}: bodies[{body.name}].{ignored[0]}: applies to a mesh, but {path.name} is an "
+                    f"asset with colours of its own; remove the key"
+                )
+            asset = Asset.load(path)
+        else:
+            asset = import_mesh(
+                path,
+                name=body.name,
+                budget=body.budget,
+                color=body.color,
+                texture=None if body.texture is None else scene.resolve(body.texture),
+                up=body.up,
+                tets=False,
+                seed=scene.seed,
+            )
+        if asset.tets is None:
+            # At the asset's own size: the caller may place several bodies of one asset at several sizes.
+            asset = tetrahedralize_asset(asset, target_tets=body.tets)
+        if asset.material is None or body.material is not None:
+            asset = replace(asset, material=_material(body, asset))
+        assets[body.name] = asset
+    return assets
+
+
+def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu") -> Model:
+    """Place every body and gather the arrays of a `Model` for `device`.
+
+    Raises SceneError where a body starts below the ground or a pin box holds no vertex.
+    """
+    bodies: list[Body] = []
+    columns: dict[str, list[np.ndarray]] = {
+        key: []
+        for key in (
+            "vertices", "velocities", "tets", "fill", "young", "poisson", "density",
+            "rayleigh_mass", "rayleigh_stiffness", "friction", "pinned",
+        )
+    }  # fmt: skip
+    vertex_begin = tet_begin = 0
+    for body in scene.bodies:
+        asset = assets[body.name]
+        if asset.tets is None or asset.embedding is None:
+            raise SceneError(f"{scene.name}: body {body.name!r}: its asset has no tetrahedra")
+        material = _material(body, asset)
+        rest = asset.gaussians.vertices.cpu().numpy()
+        factor = body.scale
+        if body.size is not None:
+            factor = body.size / float(np.ptp(rest, axis=0).max())
+        asset = asset.scaled(factor) if factor != 1.0 else asset
+        assert asset.tets is not None and asset.embedding is not None
+        rest = asset.gaussians.vertices.cpu().numpy().astype(np.float64)
+        turn = Rotation.from_euler("xyz", body.rotation, degrees=True).as_matrix()
+        turned = rest @ turn.T
+        shift = np.asarray(body.position) - _anchor(turned, body.anchor)
+        surface = (turned + shift).astype(np.float32)
+        vertices = asset.tets.vertices.astype(np.float64) @ turn.T + shift
+        centre = surface.astype(np.float64).mean(axis=0)
+        _check_above_ground(scene, body, surface)
+
+        count, elements = len(vertices), len(asset.tets.tets)
+        columns["vertices"].append(vertices.astype(np.float32))
+        spin = np.cross(np.asarray(body.angular_velocity)[None, :], vertices - centre)
+        columns["velocities"].append((spin + np.asarray(body.velocity)).astype(np.float32))
+        columns["tets"].append(asset.tets.tets + np.int32(vertex_begin))
+        columns["fill"].append(asset.tets.fill)
+        for key in ("young", "poisson", "density", "rayleigh_mass", "rayleigh_stiffness"):
+            columns[key].append(np.full(elements, getattr(material, key), np.float32))
+        columns["friction"].append(np.full(count, material.friction, np.float32))
+        columns["pinned"].append(_pinned(scene, body, vertices))
+        bodies.append(
+            Body(
+                name=body.name,
+                gaussians=asset.gaussians.to(device),
+                surface=surface,
+                embedding=asset.embedding,
+                vertex_range=(vertex_begin, vertex_begin + count),
+                tet_range=(tet_begin, tet_begin + elements),
+            )
+        )
+        vertex_begin += count
+        tet_begin += elements
+    if len(bodies) > 1:
+        logger.warning("bodies collide with the ground but not yet with each other or themselves")
+    options = scene.solver
+    return Model(
+        bodies=tuple(bodies),
+        **{key: np.concatenate(parts) for key, parts in columns.items()},
+        gravity=scene.gravity,
+        ground=None if scene.ground is None else Ground(scene.ground.height),
+        fem=FemSettings(**{k: v for k, v in options.model_dump().items() if k != "kind"}),
+        device=device,
+    )
+
+
+def _material(body: SceneBody, asset: Asset) -> Material:
+    return body.material or asset.material or Material.model_validate(FALLBACK_MATERIAL)
+
+
+def _anchor(points: np.ndarray, anchor: str) -> np.ndarray:
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = 0.5 * (low + high)
+    if anchor == "bottom":
+        return np.array([centre[0], centre[1], low[2]])
+    return centre if anchor == "center" else np.zeros(3)
+
+
+def _check_above_ground(scene: Scene, body: SceneBody, surface: np.ndarray) -> None:
+    if scene.ground is None:
+        return
+    low, extent = float(surface[:, 2].min()), float(np.ptp(surface[:, 2]))
+    below = scene.ground.height - low
+    if below > 0.05 * extent:
+        raise SceneError(
+            f"{scene.name}: body {body.name!r} starts {below:.3g} m below the ground at z = "
+            f"{scene.ground.height:g} m; raise its position by at least that much"
+        )
+
+
+def _pinned(scene: Scene, body: SceneBody, vertices: np.ndarray) -> np.ndarray:
+    if body.pins is None:
+        return np.zeros(len(vertices), bool)
+    inside = np.all((vertices >= body.pins.minimum) & (vertices <= body.pins.maximum), axis=1)
+    if not inside.any():
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        raise SceneError(
+            f"{scene.name}: body {body.name!r}: the pin box holds no vertex; the body spans "
+            f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} m"
+        )
+    return inside
+
+
+__all__ = ["compile_scene", "load_assets"]

@@ -1,0 +1,86 @@
+"""Running a scene: one frame after another, as Gaussians and deformed meshes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gdpro_sim.asset import Asset
+from gdpro_sim.device import resolve_device
+from gdpro_sim.simulation.compile import compile_scene, load_assets
+from gdpro_sim.simulation.frame import BodyFrame, Frame
+from gdpro_sim.simulation.model import Diagnostics, Model, Solver
+from gdpro_sim.simulation.scene import Scene, load_scene
+
+
+class Simulation:
+    """A compiled scene and its solver; iterating yields every `Frame`, the initial one first.
+
+    The figures of the last frame stand in `milliseconds` ("solve", "resplat").
+    """
+
+    def __init__(self, scene: Scene, assets: dict[str, Asset], *, device: str = "auto") -> None:
+        # The solver is imported here: it compiles kernels, which loading a scene should not.
+        from gdpro_sim.simulation.fem import SolverFEM
+
+        self.scene = scene
+        self.assets = assets
+        self.device = resolve_device(device)
+        self.model: Model = compile_scene(scene, assets, device=self.device)
+        self.solver: Solver = SolverFEM(self.model)
+        self.milliseconds: dict[str, float] = {"solve": 0.0, "resplat": 0.0}
+
+    def __len__(self) -> int:
+        return self.scene.frame_count
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.solver.reset()
+        for index in range(len(self)):
+            self.advance(index)
+            yield self.frame(index, self.surfaces(), self.solver.diagnostics())
+
+    def advance(self, index: int) -> None:
+        """Bring the solver from frame `index - 1` to frame `index`; frame 0 is the initial state."""
+        begin = time.perf_counter()
+        if index > 0:
+            self.solver.step(1.0 / self.scene.fps)
+        self.milliseconds["solve"] = 1e3 * (time.perf_counter() - begin)
+
+    def surfaces(self) -> list[np.ndarray]:
+        """Deformed surface vertices of every body, [V, 3] float32 m."""
+        return [self.solver.surface_positions(i) for i in range(len(self.model.bodies))]
+
+    def frame(self, index: int, surfaces: list[np.ndarray], diagnostics: Diagnostics) -> Frame:
+        """Re-splat: the Gaussians of every body carried by its surface."""
+        begin = time.perf_counter()
+        bodies = tuple(
+            BodyFrame(body.name, surface, body.gaussians.gaussians(torch.from_numpy(surface)))
+            for body, surface in zip(self.model.bodies, surfaces, strict=True)
+        )
+        self.milliseconds["resplat"] = 1e3 * (time.perf_counter() - begin)
+        return Frame(index, index / self.scene.fps, bodies, diagnostics)
+
+
+def simulate(
+    scene: Scene | str | Path,
+    *,
+    device: str = "auto",
+    on_progress: Callable[[str], None] | None = None,
+) -> Simulation:
+    """Load and compile a scene; iterate the result to run it.
+
+    scene: a `Scene`, a YAML path, or the name of a shipped scene.
+    Raises SceneError, MeshError, AssetError or DeviceError for a wrong request; iterating may raise SolverError.
+
+        for frame in gdpro_sim.simulate("jelly_bunny"):
+            print(frame.time, frame.bodies[0].gaussians.means.mean(0))
+    """
+    checked = scene if isinstance(scene, Scene) else load_scene(scene)
+    return Simulation(checked, load_assets(checked, on_progress=on_progress), device=device)
+
+
+__all__ = ["Simulation", "simulate"]

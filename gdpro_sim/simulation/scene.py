@@ -1,0 +1,273 @@
+"""Scenes: what the user wrote, in YAML or Python, checked before anything runs."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.resources
+import importlib.util
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from gdpro_sim.errors import SceneError
+from gdpro_sim.materials import Material
+
+Vector = tuple[
+    Annotated[float, Field(allow_inf_nan=False)],
+    Annotated[float, Field(allow_inf_nan=False)],
+    Annotated[float, Field(allow_inf_nan=False)],
+]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Pins(_Strict):
+    """Vertices of the body's tets held in place: those inside a world-space box at the start."""
+
+    minimum: Vector = Field(default=(-math.inf, -math.inf, -math.inf), description="lower corner, m")
+    maximum: Vector = Field(default=(math.inf, math.inf, math.inf), description="upper corner, m")
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
+
+
+class SceneBody(_Strict):
+    """One soft body."""
+
+    name: str = Field(default="", pattern=r"^([A-Za-z_][A-Za-z0-9_]*)?$", description="unique; default: from the file")
+    asset: str = Field(
+        min_length=1,
+        description="asset (.usdc, .usda, .usdz) or mesh file, relative to the scene file; "
+        "`package:NAME/PATH` is a file inside an installed Python package",
+    )
+    color: str | None = Field(default=None, description="colour of a mesh, #rrggbb or a CSS name")
+    texture: str | None = Field(default=None, description="texture image of a mesh, relative to the scene file")
+    budget: int = Field(default=50_000, ge=100, le=5_000_000, description="Gaussians to aim for when a mesh is bound")
+    up: Literal["auto", "y", "z"] = Field(default="auto", description="up axis of a mesh file")
+    tets: int = Field(default=6_000, ge=50, le=500_000, description="tetrahedra to aim for, where none are cached")
+    size: float | None = Field(default=None, gt=0.0, description="longest side of the bounding box, m")
+    scale: float = Field(default=1.0, gt=0.0, description="uniform scale, where size is not given")
+    anchor: Literal["bottom", "center", "origin"] = Field(
+        default="bottom", description="which point of the turned body `position` places"
+    )
+    position: Vector = Field(default=(0.0, 0.0, 0.0), description="m")
+    rotation: Vector = Field(default=(0.0, 0.0, 0.0), description="degrees about X, then Y, then Z")
+    velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="m/s")
+    angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="rad/s about the body's centre")
+    material: Material | None = Field(default=None, description="preset name or values; default: the asset's, else jelly")
+    pins: Pins | None = Field(default=None, description="box of vertices that never move")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_from_file(cls, value: Any) -> Any:
+        if isinstance(value, dict) and not value.get("name") and isinstance(value.get("asset"), str):
+            stem = Path(value["asset"]).stem
+            safe = "".join(ch if ch.isascii() and ch.isalnum() else "_" for ch in stem)
+            value = {**value, "name": safe if safe[:1].isalpha() else f"body_{safe}"}
+        return value
+
+
+class GroundPlane(_Strict):
+    """The floor z = height."""
+
+    height: float = Field(default=0.0, description="m")
+
+
+class Camera(_Strict):
+    """The preview's camera. Anything left out is chosen so that the bodies and their fall fit the picture."""
+
+    eye: Vector | None = Field(default=None, description="m")
+    target: Vector | None = Field(default=None, description="m")
+    azimuth: float = Field(default=-60.0, description="degrees from +X, where eye is not given")
+    elevation: float = Field(default=14.0, ge=-89.0, le=89.0, description="degrees, where eye is not given")
+    fov: float = Field(default=32.0, gt=1.0, lt=150.0, description="vertical field of view, degrees")
+    width: int = Field(default=960, ge=16, le=8192, description="pixels; even, for video")
+    height: int = Field(default=720, ge=16, le=8192, description="pixels; even, for video")
+
+    @field_validator("width", "height")
+    @classmethod
+    def _even(cls, value: int) -> int:
+        if value % 2:
+            raise ValueError(f"must be even (H.264 video), got {value}")
+        return value
+
+
+class Render(_Strict):
+    """How the preview looks."""
+
+    shading: Literal["studio", "none"] = Field(default="studio", description="studio lights and shadows, or raw colours")
+    background: Literal["studio", "white", "black"] = "studio"
+
+
+class SolverOptions(_Strict):
+    """Settings of the FEM solver; the defaults are converged for the shipped scenes."""
+
+    kind: Literal["fem"] = "fem"
+    substeps: int = Field(default=2, ge=1, le=1000, description="implicit steps per frame at least")
+    newton_iterations: int = Field(default=8, ge=1, le=1000, description="at most, per substep")
+    newton_tolerance: float = Field(default=1e-3, gt=0.0, description="largest vertex speed correction, m/s")
+    cg_tolerance: float = Field(default=1e-2, gt=0.0, lt=1.0, description="relative residual of inner conjugate gradients")
+    contact_stiffness: float = Field(default=1.0, gt=0.0, description="multiple of the automatic ground stiffness")
+
+
+class Scene(_Strict):
+    """A whole simulation: bodies, world, time, camera and solver. SI units, Z up."""
+
+    name: str = Field(default="scene", min_length=1)
+    description: str = ""
+    bodies: tuple[SceneBody, ...] = Field(min_length=1)
+    ground: GroundPlane | None = Field(default_factory=GroundPlane, description="null for no floor")
+    gravity: Vector = Field(default=(0.0, 0.0, -9.81), description="m/s^2")
+    fps: int = Field(default=30, ge=1, le=1000, description="frames per second")
+    duration: float = Field(default=3.0, gt=0.0, le=3600.0, description="s")
+    seed: int = Field(default=0, ge=0)
+    camera: Camera = Field(default_factory=Camera)
+    render: Render = Field(default_factory=Render)
+    solver: SolverOptions = Field(default_factory=SolverOptions)
+    folder: Path = Field(default_factory=Path.cwd, exclude=True, description="where relative paths start; set by load_scene")
+
+    @model_validator(mode="after")
+    def _unique_names(self) -> Scene:
+        seen: set[str] = set()
+        for body in self.bodies:
+            if body.name in seen:
+                raise ValueError(f"two bodies are named {body.name!r}; give each a `name` of its own")
+            seen.add(body.name)
+        return self
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the simulation, the initial one included."""
+        return max(1, round(self.duration * self.fps)) + 1
+
+    def resolve(self, reference: str) -> Path:
+        """Absolute path of an asset reference. Raises SceneError for an unknown `package:`."""
+        if reference.startswith("package:"):
+            package, _, inside = reference.removeprefix("package:").partition("/")
+            spec = importlib.util.find_spec(package) if package else None
+            if spec is None or not spec.submodule_search_locations:
+                raise SceneError(f"{self.name}: asset {reference!r}: no installed Python package {package!r}")
+            return Path(next(iter(spec.submodule_search_locations))) / inside
+        path = Path(reference).expanduser()
+        return path if path.is_absolute() else self.folder / path
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes shipped with the package."""
+    folder = importlib.resources.files("gdpro_sim.scenes")
+    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_scene(scene: str | Path) -> Scene:
+    """Read a scene from a YAML path, or a shipped scene by name.
+
+    Raises SceneError naming the file, the key and what is allowed.
+    """
+    path = Path(scene).expanduser()
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        names = scene_names()
+        if str(scene) not in names:
+            near = difflib.get_close_matches(str(scene), names, n=1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise SceneError(f"no scene {str(scene)!r}{hint}; give a .yaml file or one of: {', '.join(names)}")
+        with importlib.resources.as_file(importlib.resources.files("gdpro_sim.scenes") / f"{scene}.yaml") as shipped:
+            return _parse(shipped.read_text(encoding="utf-8"), f"{scene}.yaml", Path.cwd())
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no such file; `gdpro scenes` lists the shipped scenes") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: cannot be read as text: {error}") from None
+    return _parse(text, str(path), path.resolve().parent)
+
+
+def _parse(text: str, source: str, folder: Path) -> Scene:
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "unknown place"
+        raise SceneError(f"{source}: not valid YAML at {where}: {getattr(error, 'problem', None) or error}") from None
+    if not isinstance(data, dict):
+        raise SceneError(f"{source}: a scene is a mapping with at least `bodies:`, got {type(data).__name__}")
+    if "folder" in data:
+        raise SceneError(f"{source}: unknown key `folder`; asset paths are relative to the scene file")
+    return check_scene({"name": Path(source).stem, **data, "folder": folder}, source)
+
+
+def check_scene(data: dict[str, Any], source: str = "scene") -> Scene:
+    """Build a Scene from plain data; SceneError with one line per wrong value."""
+    try:
+        return Scene.model_validate(data)
+    except ValidationError as error:
+        items = error.errors()
+        # A list whose only item is wrong is reported as too short as well: say the cause alone.
+        items = [
+            a
+            for a in items
+            if a["type"] != "too_short"
+            or not any(len(b["loc"]) > len(a["loc"]) and b["loc"][: len(a["loc"])] == a["loc"] for b in items)
+        ]
+        lines = [_explain(item, source) for item in items]
+        raise SceneError("\n".join(dict.fromkeys(lines))) from None
+
+
+def _explain(item: Any, source: str) -> str:
+    """One line for one pydantic error: file, path of the key, what was expected, what was given."""
+    location = item["loc"]
+    place = ""
+    for part in location:
+        place += f"[{part}]" if isinstance(part, int) else (f".{part}" if place else str(part))
+    value = item.get("input")
+    if item["type"] == "extra_forbidden":
+        allowed = _fields_at(location[:-1])
+        near = difflib.get_close_matches(str(location[-1]), allowed, n=1)
+        hint = f" (did you mean `{near[0]}`?)" if near else ""
+        return f"{source}: {place}: unknown key{hint}; allowed: {', '.join(allowed)}"
+    if item["type"] == "missing":
+        return f"{source}: {place}: is required"
+    message = str(item["msg"])
+    message = message.removeprefix("Value error, ").replace("Input should be", "must be")
+    message = message[0].lower() + message[1:]
+    shown = "" if "got" in message or isinstance(value, dict | list) or repr(value) in message else f", got {value!r}"
+    return f"{source}: {place or 'scene'}: {message}{shown}"
+
+
+def _fields_at(location: tuple[Any, ...]) -> list[str]:
+    """Field names of the model that lives at a path inside Scene."""
+    model: type[BaseModel] = Scene
+    for part in location:
+        if isinstance(part, int) or part not in model.model_fields:
+            continue
+        found = _model_in(model.model_fields[part].annotation)
+        if found is not None:
+            model = found
+    return [name for name in model.model_fields if name != "folder"]
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in get_args(annotation):
+        found = _model_in(inner)
+        if found is not None:
+            return found
+    return None
+
+
+__all__ = [
+    "SceneBody",
+    "Camera",
+    "GroundPlane",
+    "Pins",
+    "Render",
+    "Scene",
+    "SolverOptions",
+    "check_scene",
+    "load_scene",
+    "scene_names",
+]
