@@ -42,17 +42,19 @@ class Ground:
 class FemSettings:
     """How the FEM solver steps.
 
-    substeps:          implicit steps per `step(dt)`; raised by the solver where a step fails
-    newton_iterations: most projected-Newton iterations in one substep
-    newton_tolerance:  stop when the Newton step's largest vertex move is below this times dt, m/s
-    cg_tolerance:      relative residual of the inner conjugate gradients
-    contact_stiffness: ground penalty stiffness as a multiple of the stiffness that the body's own
-                       elasticity and inertia set
+    substeps:          implicit steps per `step(dt)`; a substep that fails is halved by the solver
+    newton_iterations: most projected-Newton iterations in one substep before it counts as failed
+    newton_tolerance:  stop when a full Newton step moves no vertex by more than this times dt, m/s
+    cg_iterations:     most inner conjugate gradient iterations per Newton iteration
+    cg_tolerance:      relative (preconditioned) residual of the inner conjugate gradients
+    contact_stiffness: multiple of the ground penalty stiffness that the solver derives from each body's
+                       own elasticity and weight
     """
 
     substeps: int = 2
-    newton_iterations: int = 8
+    newton_iterations: int = 20
     newton_tolerance: float = 1e-3
+    cg_iterations: int = 2000
     cg_tolerance: float = 1e-2
     contact_stiffness: float = 1.0
 

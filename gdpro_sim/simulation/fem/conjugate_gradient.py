@@ -1,0 +1,133 @@
+"""Block-Jacobi preconditioned conjugate gradients on the fixed block rows."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from gdpro_sim.device import launch_chunked
+from gdpro_sim.kernels import linalg
+from gdpro_sim.simulation.fem.topology import Topology
+
+ROW_BLOCKS = 128
+"""Partial sums of one dot product: fixed, so that its value does not depend on the number of threads."""
+
+SERIAL_ROWS = 8192
+"""Up to this many rows one thread inside one launch beats launches spread over the cores (measured)."""
+
+CUDA_CHECK_EVERY = 16
+"""On CUDA the host looks at the residual only so often; steps past convergence change nothing."""
+
+
+class SolveReport(NamedTuple):
+    iterations: int
+    converged: bool
+
+
+class ConjugateGradient:
+    """Solves A x = b; holds A's values and every work vector, so a solve allocates nothing.
+
+    values:            [N] mat33d entries of A in the order of `Topology.columns`
+    inverse_diagonal:  [P] mat33d preconditioner
+    right_hand_side:   [P] vec3d
+    solution:          [P] vec3d
+    """
+
+    def __init__(self, topology: Topology, device: str, *, serial_rows: int = SERIAL_ROWS) -> None:
+        self.device = device
+        self.rows = len(topology.offsets) - 1
+        self.serial = device == "cpu" and self.rows <= serial_rows
+        self.blocks = min(ROW_BLOCKS, self.rows) if device == "cpu" else self.rows
+        self.offsets = wp.array(topology.offsets, dtype=wp.int32, device=device)
+        self.columns = wp.array(topology.columns, dtype=wp.int32, device=device)
+        self.values = wp.zeros(len(topology.columns), dtype=wp.mat33d, device=device)
+        self.inverse_diagonal = wp.zeros(self.rows, dtype=wp.mat33d, device=device)
+        self.right_hand_side, self.solution, self._r, self._z, self._p, self._q = (
+            wp.zeros(self.rows, dtype=wp.vec3d, device=device) for _ in range(6)
+        )
+        self._dots = wp.zeros(self.blocks, dtype=wp.float64, device=device)
+        self._sums = wp.zeros(ROW_BLOCKS, dtype=wp.float64, device=device)
+        self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
+
+    def solve(self, tolerance: float, max_iterations: int) -> SolveReport:
+        """Solve until the preconditioned residual has fallen by `tolerance`, starting from zero."""
+        if self.serial:
+            self._solve_serial(tolerance, max_iterations)
+        else:
+            self._solve_phases(tolerance, max_iterations)
+        scalars = self._scalars.numpy()
+        return SolveReport(int(scalars[linalg.CG_ITERATIONS]), bool(scalars[linalg.CG_DONE]))
+
+    def _solve_serial(self, tolerance: float, max_iterations: int) -> None:
+        wp.launch(
+            linalg.cg_serial,
+            dim=1,
+            inputs=[
+                self.rows,
+                max_iterations,
+                tolerance,
+                self.offsets,
+                self.columns,
+                self.values,
+                self.inverse_diagonal,
+                self.right_hand_side,
+            ],
+            outputs=[self._r, self._z, self._p, self._q, self.solution, self._scalars],
+            device=self.device,
+        )
+
+    def _solve_phases(self, tolerance: float, max_iterations: int) -> None:
+        matrix = [self.offsets, self.columns, self.values]
+        self._over_rows(
+            linalg.cg_reset,
+            [self.right_hand_side, self.inverse_diagonal],
+            [self.solution, self._r, self._z, self._p, self._dots],
+        )
+        self._scalar(linalg.cg_begin, [])
+        check_every = 1 if self.device == "cpu" else CUDA_CHECK_EVERY
+        for iteration in range(max_iterations):
+            if iteration % check_every == 0 and self._scalars.numpy()[linalg.CG_DONE] != 0.0:
+                break
+            self._over_rows(linalg.cg_direction, [self._z, self._scalars], [self._p])
+            self._over_rows(linalg.cg_product, [*matrix, self._p], [self._q, self._dots])
+            self._scalar(linalg.cg_set_alpha, [])
+            self._over_rows(
+                linalg.cg_update,
+                [self._p, self._q, self.inverse_diagonal, self._scalars],
+                [self.solution, self._r, self._z, self._dots],
+            )
+            self._scalar(linalg.cg_set_beta, [tolerance])
+
+    def _over_rows(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        launch_chunked(
+            kernel,
+            self.blocks,
+            [self.rows, self.blocks, *inputs],
+            outputs,
+            device=self.device,
+            minimum=ROW_BLOCKS // 16,
+        )
+
+    def _scalar(self, kernel: wp.Kernel, parameters: list[Any]) -> None:
+        dots, count = self._dots, self.blocks
+        if self.device != "cpu":
+            launch_chunked(
+                linalg.sum_ranges, ROW_BLOCKS, [count, ROW_BLOCKS, dots], [self._sums], device=self.device
+            )
+            dots, count = self._sums, ROW_BLOCKS
+        wp.launch(
+            kernel, dim=1, inputs=[count, *parameters, dots], outputs=[self._scalars], device=self.device
+        )
+
+    def matrix(self) -> Any:
+        """A as a scipy BSR matrix (a copy), for tests and debugging."""
+        from scipy.sparse import bsr_matrix
+
+        count = 3 * self.rows
+        parts = (self.values.numpy().copy(), np.array(self.columns.numpy()), np.array(self.offsets.numpy()))
+        return bsr_matrix(parts, shape=(count, count))
+
+
+__all__ = ["ConjugateGradient", "SolveReport"]

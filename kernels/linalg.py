@@ -1,0 +1,349 @@
+"""3x3 block-sparse rows, block-Jacobi preconditioned conjugate gradients, and sums in a fixed order.
+
+Every sum is taken over ranges that depend on the problem's size alone, never on the number of threads, so
+results are the same bytes for any thread count. `start` (first argument) is the index of the launch's first
+item, see `gdpro_sim.device.launch_chunked`.
+
+Conjugate gradients come in two forms with the same arithmetic: `cg_serial` runs a whole solve inside one
+launch (no launch overhead: best on the CPU up to some thousand rows), and the `cg_*` steps run one phase per
+launch, spread over CPU threads or a CUDA device, with every scalar kept in device memory.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+# Slots of the scalar array that the conjugate gradient steps share.
+CG_ALPHA = wp.constant(0)
+CG_BETA = wp.constant(1)
+CG_RZ = wp.constant(2)
+CG_RZ_START = wp.constant(3)
+CG_DONE = wp.constant(4)
+CG_ITERATIONS = wp.constant(5)
+
+
+@wp.func_native("""
+    // Plain loads over the rows' 9 consecutive doubles: twice as fast on the CPU as Warp's matrix type.
+    const int* columns_ = columns.data;
+    const double* values_ = reinterpret_cast<const double*>(values.data);
+    const double* x_ = reinterpret_cast<const double*>(x.data);
+    double s0 = 0.0, s1 = 0.0, s2 = 0.0;
+    for (int k = begin; k < end; ++k) {
+        const double* m = values_ + 9 * static_cast<size_t>(k);
+        const double* v = x_ + 3 * static_cast<size_t>(columns_[k]);
+        s0 += m[0] * v[0] + m[1] * v[1] + m[2] * v[2];
+        s1 += m[3] * v[0] + m[4] * v[1] + m[5] * v[2];
+        s2 += m[6] * v[0] + m[7] * v[1] + m[8] * v[2];
+    }
+    return wp::vec3d(s0, s1, s2);
+""")
+def row_product(
+    begin: int,
+    end: int,
+    columns: wp.array[wp.int32],
+    values: wp.array[wp.mat33d],
+    x: wp.array[wp.vec3d],
+) -> wp.vec3d:
+    """Sum over k in [begin, end) of values[k] x[columns[k]]."""
+    ...
+
+
+@wp.func
+def block_range(count: int, blocks: int, block: int) -> wp.vec2i:
+    """The `block`-th of `blocks` contiguous ranges that cover `range(count)`."""
+    size = (count + blocks - 1) // blocks
+    begin = wp.min(block * size, count)
+    return wp.vec2i(begin, wp.min(begin + size, count))
+
+
+@wp.kernel
+def sum_ranges(
+    start: int,
+    # In:
+    count: int,
+    ranges: int,
+    terms: wp.array[wp.float64],
+    # Out:
+    sums_out: wp.array[wp.float64],
+):
+    """sums_out[i] = sum of `terms` over the i-th of `ranges` contiguous ranges."""
+    i = start + wp.tid()
+    bounds = block_range(count, ranges, i)
+    total = wp.float64(0.0)
+    for k in range(bounds[0], bounds[1]):
+        total += terms[k]
+    sums_out[i] = total
+
+
+@wp.kernel
+def gather_off_diagonal(
+    start: int,
+    # In:
+    offsets: wp.array[wp.int32],
+    contributions: wp.array[wp.int32],
+    element_blocks: wp.array[wp.mat33d],
+    upper: wp.array[wp.int32],
+    lower: wp.array[wp.int32],
+    # Out:
+    values_out: wp.array[wp.mat33d],
+):
+    """Sum the element blocks of one off-diagonal pair into its two mirrored places.
+
+    A contribution is 2 * (index of the element block) + (1 if it enters transposed).
+    """
+    i = start + wp.tid()
+    total = wp.mat33d()
+    for k in range(offsets[i], offsets[i + 1]):
+        code = contributions[k]
+        block = element_blocks[code >> 1]
+        if (code & 1) != 0:
+            total += wp.transpose(block)
+        else:
+            total += block
+    values_out[upper[i]] = total
+    values_out[lower[i]] = wp.transpose(total)
+
+
+@wp.func
+def cg_reset_row(
+    i: int,
+    right_hand_side: wp.array[wp.vec3d],
+    inverse_diagonal: wp.array[wp.mat33d],
+    x_out: wp.array[wp.vec3d],
+    r_out: wp.array[wp.vec3d],
+    z_out: wp.array[wp.vec3d],
+    p_out: wp.array[wp.vec3d],
+) -> wp.float64:
+    r = right_hand_side[i]
+    z = inverse_diagonal[i] * r
+    x_out[i] = wp.vec3d()
+    r_out[i] = r
+    z_out[i] = z
+    p_out[i] = wp.vec3d()
+    return wp.dot(r, z)
+
+
+@wp.func
+def cg_update_row(
+    i: int,
+    alpha: wp.float64,
+    p: wp.array[wp.vec3d],
+    q: wp.array[wp.vec3d],
+    inverse_diagonal: wp.array[wp.mat33d],
+    x_out: wp.array[wp.vec3d],
+    r_out: wp.array[wp.vec3d],
+    z_out: wp.array[wp.vec3d],
+) -> wp.float64:
+    x_out[i] = x_out[i] + alpha * p[i]
+    r = r_out[i] - alpha * q[i]
+    z = inverse_diagonal[i] * r
+    r_out[i] = r
+    z_out[i] = z
+    return wp.dot(r, z)
+
+
+@wp.kernel
+def cg_serial(
+    # In:
+    rows: int,
+    max_iterations: int,
+    tolerance: wp.float64,
+    offsets: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    values: wp.array[wp.mat33d],
+    inverse_diagonal: wp.array[wp.mat33d],
+    right_hand_side: wp.array[wp.vec3d],
+    # Work:
+    r_out: wp.array[wp.vec3d],
+    z_out: wp.array[wp.vec3d],
+    p_out: wp.array[wp.vec3d],
+    q_out: wp.array[wp.vec3d],
+    # Out:
+    x_out: wp.array[wp.vec3d],
+    scalars_out: wp.array[wp.float64],
+):
+    """Preconditioned conjugate gradients (Saad, Iterative Methods, 2nd ed., algorithm 9.1), one thread.
+
+    Stops when r.M^-1 r has fallen by tolerance^2. Launch with dim 1.
+    """
+    rz = wp.float64(0.0)
+    for i in range(rows):
+        rz += cg_reset_row(i, right_hand_side, inverse_diagonal, x_out, r_out, z_out, p_out)
+    scalars_out[CG_RZ_START] = rz
+    target = rz * tolerance * tolerance
+    beta = wp.float64(0.0)
+    iteration = int(0)
+    done = rz <= wp.float64(0.0)
+    while not done and iteration < max_iterations:
+        for i in range(rows):
+            p_out[i] = z_out[i] + beta * p_out[i]
+        pq = wp.float64(0.0)
+        for i in range(rows):
+            q = row_product(offsets[i], offsets[i + 1], columns, values, p_out)
+            q_out[i] = q
+            pq += wp.dot(p_out[i], q)
+        if pq <= wp.float64(0.0):
+            break
+        alpha = rz / pq
+        previous = rz
+        rz = wp.float64(0.0)
+        for i in range(rows):
+            rz += cg_update_row(i, alpha, p_out, q_out, inverse_diagonal, x_out, r_out, z_out)
+        beta = rz / previous
+        iteration += 1
+        done = rz <= target
+    scalars_out[CG_RZ] = rz
+    scalars_out[CG_ITERATIONS] = wp.float64(iteration)
+    scalars_out[CG_DONE] = wp.where(done, wp.float64(1.0), wp.float64(0.0))
+
+
+@wp.kernel
+def cg_reset(
+    start: int,
+    # In:
+    rows: int,
+    blocks: int,
+    right_hand_side: wp.array[wp.vec3d],
+    inverse_diagonal: wp.array[wp.mat33d],
+    # Out:
+    x_out: wp.array[wp.vec3d],
+    r_out: wp.array[wp.vec3d],
+    z_out: wp.array[wp.vec3d],
+    p_out: wp.array[wp.vec3d],
+    dots_out: wp.array[wp.float64],
+):
+    block = start + wp.tid()
+    bounds = block_range(rows, blocks, block)
+    total = wp.float64(0.0)
+    for i in range(bounds[0], bounds[1]):
+        total += cg_reset_row(i, right_hand_side, inverse_diagonal, x_out, r_out, z_out, p_out)
+    dots_out[block] = total
+
+
+@wp.kernel
+def cg_direction(
+    start: int,
+    # In:
+    rows: int,
+    blocks: int,
+    z: wp.array[wp.vec3d],
+    scalars: wp.array[wp.float64],
+    # Out:
+    p_out: wp.array[wp.vec3d],
+):
+    """p = z + beta p"""
+    bounds = block_range(rows, blocks, start + wp.tid())
+    beta = scalars[CG_BETA]
+    for i in range(bounds[0], bounds[1]):
+        p_out[i] = z[i] + beta * p_out[i]
+
+
+@wp.kernel
+def cg_product(
+    start: int,
+    # In:
+    rows: int,
+    blocks: int,
+    offsets: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    values: wp.array[wp.mat33d],
+    p: wp.array[wp.vec3d],
+    # Out:
+    q_out: wp.array[wp.vec3d],
+    dots_out: wp.array[wp.float64],
+):
+    """q = A p, and p.q per block of rows."""
+    block = start + wp.tid()
+    bounds = block_range(rows, blocks, block)
+    total = wp.float64(0.0)
+    for i in range(bounds[0], bounds[1]):
+        q = row_product(offsets[i], offsets[i + 1], columns, values, p)
+        q_out[i] = q
+        total += wp.dot(p[i], q)
+    dots_out[block] = total
+
+
+@wp.kernel
+def cg_update(
+    start: int,
+    # In:
+    rows: int,
+    blocks: int,
+    p: wp.array[wp.vec3d],
+    q: wp.array[wp.vec3d],
+    inverse_diagonal: wp.array[wp.mat33d],
+    scalars: wp.array[wp.float64],
+    # Out:
+    x_out: wp.array[wp.vec3d],
+    r_out: wp.array[wp.vec3d],
+    z_out: wp.array[wp.vec3d],
+    dots_out: wp.array[wp.float64],
+):
+    """x += alpha p, r -= alpha q, z = M^-1 r, and r.z per block of rows."""
+    block = start + wp.tid()
+    bounds = block_range(rows, blocks, block)
+    alpha = scalars[CG_ALPHA]
+    total = wp.float64(0.0)
+    for i in range(bounds[0], bounds[1]):
+        total += cg_update_row(i, alpha, p, q, inverse_diagonal, x_out, r_out, z_out)
+    dots_out[block] = total
+
+
+@wp.kernel
+def cg_begin(
+    # In:
+    count: int,
+    dots: wp.array[wp.float64],
+    # Out:
+    scalars_out: wp.array[wp.float64],
+):
+    total = wp.float64(0.0)
+    for k in range(count):
+        total += dots[k]
+    scalars_out[CG_ALPHA] = wp.float64(0.0)
+    scalars_out[CG_BETA] = wp.float64(0.0)
+    scalars_out[CG_RZ] = total
+    scalars_out[CG_RZ_START] = total
+    scalars_out[CG_ITERATIONS] = wp.float64(0.0)
+    scalars_out[CG_DONE] = wp.where(total <= wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
+
+
+@wp.kernel
+def cg_set_alpha(
+    # In:
+    count: int,
+    dots: wp.array[wp.float64],
+    # Out:
+    scalars_out: wp.array[wp.float64],
+):
+    """alpha = r.z / p.q; zero once converged, so that steps taken past convergence change nothing."""
+    total = wp.float64(0.0)
+    for k in range(count):
+        total += dots[k]
+    alpha = wp.float64(0.0)
+    if scalars_out[CG_DONE] == wp.float64(0.0) and total > wp.float64(0.0):
+        alpha = scalars_out[CG_RZ] / total
+    scalars_out[CG_ALPHA] = alpha
+
+
+@wp.kernel
+def cg_set_beta(
+    # In:
+    count: int,
+    tolerance: wp.float64,
+    dots: wp.array[wp.float64],
+    # Out:
+    scalars_out: wp.array[wp.float64],
+):
+    """beta = r.z / previous r.z; marks the solve done when r.z has fallen by tolerance^2."""
+    total = wp.float64(0.0)
+    for k in range(count):
+        total += dots[k]
+    if scalars_out[CG_DONE] == wp.float64(0.0):
+        scalars_out[CG_BETA] = total / scalars_out[CG_RZ]
+        scalars_out[CG_RZ] = total
+        scalars_out[CG_ITERATIONS] = scalars_out[CG_ITERATIONS] + wp.float64(1.0)
+        if total <= scalars_out[CG_RZ_START] * tolerance * tolerance:
+            scalars_out[CG_DONE] = wp.float64(1.0)
