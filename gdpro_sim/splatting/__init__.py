@@ -1,1 +1,5 @@
+"""Image formation: Gaussians and cameras in, colour, alpha and depth images out."""
 
+from gdpro_sim.splatting.rasterization import RasterOptions, rasterization
+
+__all__ = ["RasterOptions", "rasterization"]

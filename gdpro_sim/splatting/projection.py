@@ -1,0 +1,180 @@
+"""First stage: Gaussians in space -> records of 2D Gaussians with colours, one for each camera and Gaussian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from gdpro_sim.device import launch_chunked
+from gdpro_sim.kernels import projection as kernels
+
+
+@dataclass(frozen=True)
+class View:
+    """C cameras and the image they make, checked. near, far in metres; the rest in pixels."""
+
+    viewmats: torch.Tensor
+    Ks: torch.Tensor
+    width: int
+    height: int
+    near: float
+    far: float
+    radius_clip: float
+    eps2d: float
+    antialiased: bool
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Columns and rows of tiles."""
+        tile = int(kernels.TILE)
+        return -(-self.width // tile), -(-self.height // tile)
+
+
+@dataclass(frozen=True)
+class Projection:
+    """C x N projected Gaussians; M = C N, record c N + n is Gaussian n seen by camera c.
+
+    records: [M, 16] float32, see `gdpro_sim.kernels.projection`; zeros where culled
+    radii:   [M, 2] int32, half extents in pixels of the box outside which alpha < 1/255; zeros where culled
+    rects:   [M, 4] int32, tiles touched: x begin, y begin, x end, y end (exclusive); zeros where culled
+    order:   [C, 2 N] int32, of which order[:, :N] are record numbers in ascending depth, culled ones last
+    """
+
+    records: torch.Tensor
+    radii: torch.Tensor
+    rects: torch.Tensor
+    order: torch.Tensor
+    cameras: int
+    gaussians: int
+
+    def _field(self, first: int, width: int) -> torch.Tensor:
+        return self.records.view(self.cameras, self.gaussians, kernels.RECORD)[..., first : first + width]
+
+    @property
+    def means2d(self) -> torch.Tensor:
+        """[C, N, 2] pixels, a view of the records."""
+        return self._field(kernels.MEAN, 2)
+
+    @property
+    def depths(self) -> torch.Tensor:
+        """[C, N] camera-space z in metres, a view of the records."""
+        return self._field(kernels.DEPTH, 1)[..., 0]
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        """[C, N] opacities, times the compensation factor where antialiased; a view of the records."""
+        return self._field(kernels.OPACITY, 1)[..., 0]
+
+    @property
+    def conics(self) -> torch.Tensor:
+        """[C, N, 3] upper triangle of the inverse 2D covariance, 1/pixel^2; computed on each access."""
+        a, b, d = self._field(kernels.FACTOR, 3).unbind(-1)
+        return torch.stack([a * a, a * b, b * b + d * d], dim=-1) / kernels.HALF_LOG2_E
+
+
+def array(tensor: torch.Tensor, dtype: type) -> wp.array:
+    """The tensor's memory as a Warp array; trailing axes become vectors or matrices where `dtype` is one."""
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
+
+
+def device_name(tensor: torch.Tensor) -> str:
+    """Warp's name of the tensor's device; starts Warp where it is not yet running."""
+    wp.init()
+    return str(wp.device_from_torch(tensor.device))
+
+
+def project(
+    means: torch.Tensor, quats: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, view: View
+) -> Projection:
+    """Project N >= 1 Gaussians into C >= 1 cameras and sort each camera's by depth; channels are not set yet."""
+    cameras, count = len(view.viewmats), len(means)
+    total = cameras * count
+    device = device_name(means)
+    records = means.new_empty((total, int(kernels.RECORD)))
+    radii = means.new_empty((total, 2), dtype=torch.int32)
+    rects = means.new_empty((total, 4), dtype=torch.int32)
+    keys = means.new_empty((cameras, 2 * count))
+    order = means.new_empty((cameras, 2 * count), dtype=torch.int32)
+    launch_chunked(
+        kernels.project,
+        total,
+        [
+            array(means, wp.vec3),
+            array(quats, wp.vec4),
+            array(scales, wp.vec3),
+            array(opacities, wp.float32),
+            array(view.viewmats, wp.mat44),
+            array(view.Ks, wp.mat33),
+            view.width,
+            view.height,
+            view.near,
+            view.far,
+            view.radius_clip,
+            view.eps2d,
+            view.antialiased,
+        ],
+        [
+            array(records, wp.float32),
+            array(radii, wp.vec2i),
+            array(rects, wp.vec4i),
+            array(keys, wp.float32),
+            array(order, wp.int32),
+        ],
+        device=device,
+    )
+    for camera in range(cameras):
+        wp.utils.radix_sort_pairs(array(keys[camera], wp.float32), array(order[camera], wp.int32), count)
+    return Projection(records, radii, rects, order, cameras, count)
+
+
+def shade_harmonics(projection: Projection, means: torch.Tensor, sh: torch.Tensor, degree: int, view: View) -> None:
+    """Set channels 0-2 from spherical harmonics [N, K, 3] and channel 3 to depth; cull where not finite."""
+    launch_chunked(
+        kernels.shade_harmonics,
+        len(projection.records),
+        [array(means, wp.vec3), array(sh, wp.vec3), degree, array(view.viewmats, wp.mat44)],
+        _culled(projection),
+        device=device_name(means),
+    )
+
+
+def shade_features(projection: Projection, features: torch.Tensor) -> None:
+    """Set the first four of (features [N or C N, D], depth) as channels; cull where a feature is not finite."""
+    launch_chunked(
+        kernels.shade_features,
+        len(projection.records),
+        [array(features, wp.float32)],
+        _culled(projection),
+        device=device_name(features),
+    )
+
+
+def pack_channels(projection: Projection, features: torch.Tensor, first: int) -> torch.Tensor:
+    """Entries first .. first + 3 of (features [N or C N, D], depth), zero past the end: [M, 4]."""
+    channels = features.new_empty((len(projection.records), 4))
+    launch_chunked(
+        kernels.pack_channels,
+        len(channels),
+        [
+            array(features, wp.float32),
+            array(projection.records, wp.float32),
+            array(projection.rects, wp.vec4i),
+            first,
+        ],
+        [array(channels, wp.float32)],
+        device=device_name(features),
+    )
+    return channels
+
+
+def _culled(projection: Projection) -> list[wp.array]:
+    return [
+        array(projection.records, wp.float32),
+        array(projection.radii, wp.vec2i),
+        array(projection.rects, wp.vec4i),
+    ]
+
+
+__all__ = ["Projection", "View", "array", "device_name", "pack_channels", "project", "shade_features", "shade_harmonics"]

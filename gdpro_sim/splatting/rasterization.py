@@ -1,0 +1,224 @@
+"""Images of 3D Gaussians: project, bin into tiles, composite."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from gdpro_sim.splatting.checks import (
+    INDEX_LIMIT,
+    check_choice,
+    check_count,
+    check_number,
+    check_size,
+    check_tensor,
+)
+from gdpro_sim.splatting.compositing import Composite, composite
+from gdpro_sim.splatting.projection import Projection, View, project, shade_features, shade_harmonics
+from gdpro_sim.splatting.tiles import bin_tiles, count_and_fill, empty_lists, expand_and_sort
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+METHODS = ("auto", "tile", "pixel")
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """Rarely needed settings of `rasterization`.
+
+    method:           "tile" (CPU only: vectorised over a tile), "pixel" (one index per pixel, what a GPU runs; on
+                      a CPU slow, for comparison) or "auto", the one made for the device
+    max_tile_entries: most (tile, Gaussian) pairs to make; more raise RequestError before memory is taken (4 bytes
+                      each on a CPU, 16 on a GPU)
+    """
+
+    method: str = "auto"
+    max_tile_entries: int = INDEX_LIMIT
+
+    def __post_init__(self) -> None:
+        check_choice("RasterOptions.method", self.method, METHODS)
+        entries = self.max_tile_entries
+        if isinstance(entries, bool) or not isinstance(entries, int) or not 0 <= entries <= INDEX_LIMIT:
+            raise ValueError(f"RasterOptions.max_tile_entries must be a whole number from 0 to {INDEX_LIMIT}, got {entries!r}")
+
+
+def rasterization(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    backgrounds: torch.Tensor | None = None,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    options: RasterOptions | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Render N 3D Gaussians into C cameras, with gsplat's names and conventions.
+
+    All tensors are float32 on one device, CPU or CUDA, which decides where the work is done; memory is shared
+    with Warp, not copied. On a CPU the result is the same to the bit for any number of threads. There are no
+    gradients yet.
+
+    means      [N, 3] metres
+    quats      [N, 4] wxyz, any length but zero
+    scales     [N, 3] metres, standard deviations along the rotated axes
+    opacities  [N] in [0, 1]
+    colors     [N, K, 3] spherical-harmonics coefficients, K >= (sh_degree + 1)^2, where `sh_degree` (0-3) is given:
+               colour = max(0, SH(direction) + 0.5). Else [N, D] or [C, N, D] features of any D >= 1, blended as
+               they are. Not used in modes "D" and "ED"
+    viewmats   [C, 4, 4] rigid, world to camera, OpenCV axes (+z forward, +y down)
+    Ks         [C, 3, 3] pixels; pixel centres lie at +0.5
+    width, height  image size in pixels
+    near_plane, far_plane  metres along z; Gaussians whose centre lies outside are not drawn
+    radius_clip  pixels; Gaussians whose box has both half extents at most this are not drawn
+    eps2d      pixels^2 added to the diagonal of 2D covariances
+    backgrounds  [C, D] colour behind everything; never added to depth
+    render_mode  "RGB" (colours or features), "D" (sum of weight times depth), "ED" (that over alpha: expected
+               depth), "RGB+D", "RGB+ED" (depth as last channel). Depth is z of centres, in metres
+    rasterize_mode  "classic", or "antialiased": opacity times sqrt(det covariance / det blurred covariance)
+
+    Returns colours [C, H, W, D], alphas [C, H, W, 1] and a dict with
+        width, height, tile_size, tile_width, tile_height, n_cameras  numbers
+        means2d [C, N, 2], depths [C, N], opacities [C, N], radii [C, N, 2] (pixels; zero where not drawn)
+        isect_offsets [C, tile_height, tile_width], flatten_ids [E]   tile lists: Gaussian c N + n, front to back
+        transmittance [C, H, W]                                       what reaches the background
+        projection, tile_lists, composite                             the stages' own results
+
+    A Gaussian is not drawn where its parameters or colour hold NaN or infinity, or its quaternion is zero.
+    Raises ValueError where an argument is malformed or requires grad, and RequestError where counts do not fit
+    32-bit indices.
+
+    Source: Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023); projection from
+    Zwicker et al., "EWA Splatting" (2002); antialiasing from Yu et al., "Mip-Splatting" (2024), eq. 9.
+    """
+    options = RasterOptions() if options is None else options
+    means = check_tensor("means", means, ("N", 3))
+    count = len(means)
+    quats = check_tensor("quats", quats, (count, 4), means)
+    scales = check_tensor("scales", scales, (count, 3), means)
+    opacities = check_tensor("opacities", opacities, (count,), means)
+    viewmats = check_tensor("viewmats", viewmats, ("C", 4, 4), means)
+    cameras = len(viewmats)
+    view = View(
+        viewmats,
+        check_tensor("Ks", Ks, (cameras, 3, 3), means),
+        check_size("width", width),
+        check_size("height", height),
+        check_number("near_plane", near_plane, 0.0),
+        check_number("far_plane", far_plane, 0.0),
+        check_number("radius_clip", radius_clip, 0.0),
+        check_number("eps2d", eps2d, 0.0),
+        check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES) == "antialiased",
+    )
+    check_choice("render_mode", render_mode, RENDER_MODES)
+    with_colors = render_mode.startswith("RGB")
+    with_depth = render_mode != "RGB"
+    colors = _check_colors(colors, sh_degree, cameras, count, means)
+    features = 0 if not with_colors else 3 if sh_degree is not None else colors.shape[-1]
+    channels = features + with_depth
+    background = means.new_zeros((cameras, channels))
+    if backgrounds is not None:
+        background[:, :features] = check_tensor("backgrounds", backgrounds, (cameras, colors.shape[-1]), means)[:, :features]
+    divided = channels - 1 if render_mode.endswith("ED") else -1
+
+    columns, rows = view.tiles
+    check_count("Gaussians times cameras", cameras * count)
+    check_count("image values (cameras x height x width x channels)", cameras * height * width * channels)
+    check_count("pixels of all tiles", cameras * rows * columns * 256)
+
+    tile = options.method == "tile" or (options.method == "auto" and means.device.type == "cpu")
+    if tile and means.device.type != "cpu":
+        raise ValueError(f'RasterOptions.method "tile" runs on the CPU only; the tensors are on {means.device}')
+
+    if cameras == 0 or count == 0:
+        projection = _nothing(cameras, count, means)
+        lists = empty_lists(cameras, view, means.device)
+        flat = None
+    else:
+        projection = project(means, quats, scales, opacities, view)
+        if with_colors and sh_degree is not None:
+            shade_harmonics(projection, means, colors, sh_degree, view)
+            flat = None
+        else:
+            flat = colors.reshape(-1, features) if with_colors else means.new_empty((count, 0))
+            shade_features(projection, flat)
+        lists = (count_and_fill if tile else expand_and_sort)(projection, view, options.max_tile_entries)
+    if cameras == 0:
+        result = _no_images(view, channels, means)
+    else:
+        result = composite(projection, lists, flat, background, divided, view, tile=tile)
+    meta = {
+        "width": width,
+        "height": height,
+        "tile_size": 16,
+        "tile_width": columns,
+        "tile_height": rows,
+        "n_cameras": cameras,
+        "means2d": projection.means2d,
+        "depths": projection.depths,
+        "opacities": projection.opacities,
+        "radii": projection.radii.view(cameras, count, 2),
+        "isect_offsets": lists.offsets[:-1].view(cameras, rows, columns),
+        "flatten_ids": lists.ids,
+        "transmittance": result.transmittance,
+        "projection": projection,
+        "tile_lists": lists,
+        "composite": result,
+    }
+    return result.image, result.alphas, meta
+
+
+def _check_colors(colors: object, sh_degree: int | None, cameras: int, count: int, means: torch.Tensor) -> torch.Tensor:
+    if sh_degree is None:
+        if isinstance(colors, torch.Tensor) and colors.ndim == 3:
+            colors = check_tensor("colors", colors, (cameras, count, "D"), means)
+        else:
+            colors = check_tensor("colors", colors, (count, "D"), means)
+        if colors.shape[-1] < 1:
+            raise ValueError(f"colors must have at least one channel, got shape {list(colors.shape)}")
+        return colors
+    if isinstance(sh_degree, bool) or not isinstance(sh_degree, int) or not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree must be 0, 1, 2, 3 or None, got {sh_degree!r}")
+    colors = check_tensor("colors", colors, (count, "K", 3), means)
+    if colors.shape[1] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"colors must hold at least {(sh_degree + 1) ** 2} coefficients for sh_degree {sh_degree}, "
+            f"got shape {list(colors.shape)}"
+        )
+    return colors
+
+
+def _nothing(cameras: int, count: int, means: torch.Tensor) -> Projection:
+    total = cameras * count
+    return Projection(
+        means.new_zeros((total, 16)),
+        means.new_zeros((total, 2), dtype=torch.int32),
+        means.new_zeros((total, 4), dtype=torch.int32),
+        means.new_zeros((cameras, 2 * count), dtype=torch.int32),
+        cameras,
+        count,
+    )
+
+
+def _no_images(view: View, channels: int, means: torch.Tensor) -> Composite:
+    return Composite(
+        means.new_zeros((0, view.height, view.width, channels)),
+        means.new_zeros((0, view.height, view.width, 1)),
+        means.new_zeros((0, view.height, view.width)),
+        means.new_zeros(0, dtype=torch.int32),
+    )
+
+
+__all__ = ["RasterOptions", "rasterization"]

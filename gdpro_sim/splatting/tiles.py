@@ -1,0 +1,98 @@
+"""Second stage: projected Gaussians -> for each tile, the list of those that touch it, front to back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from gdpro_sim.device import launch_chunked, thread_count
+from gdpro_sim.kernels import tiles as kernels
+from gdpro_sim.splatting.checks import INDEX_LIMIT, check_count
+from gdpro_sim.splatting.projection import Projection, View, array, device_name
+
+PART = 4096
+"""Fewest Gaussians worth a part (and so a thread) of the counting sort."""
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Lists of C x rows x columns tiles; tile t holds ids[offsets[t] : offsets[t + 1]].
+
+    offsets: [C rows columns + 1] int32
+    ids:     [E] int32, record numbers
+    """
+
+    offsets: torch.Tensor
+    ids: torch.Tensor
+
+
+def bin_tiles(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
+    """List each tile's Gaussians by depth. Raises RequestError where more than `limit` entries are needed."""
+    if projection.records.device.type == "cpu":
+        return count_and_fill(projection, view, limit)
+    return expand_and_sort(projection, view, limit)
+
+
+def empty_lists(cameras: int, view: View, device: torch.device) -> TileLists:
+    columns, rows = view.tiles
+    return TileLists(
+        torch.zeros(cameras * rows * columns + 1, dtype=torch.int32, device=device),
+        torch.empty(0, dtype=torch.int32, device=device),
+    )
+
+
+def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
+    """Counting sort, for CPUs. The lists do not depend on the number of threads."""
+    columns, rows = view.tiles
+    tiles = projection.cameras * rows * columns
+    total = len(projection.records)
+    parts = max(1, min(thread_count(), total // PART))
+    rects = array(projection.rects, wp.vec4i)
+    order = array(projection.order, wp.int32)
+    counts = torch.zeros((parts, tiles), dtype=torch.int32)
+    offsets = torch.empty(tiles + 1, dtype=torch.int32)
+    entries = torch.empty(1, dtype=torch.int64)
+    inputs = [order, rects, projection.gaussians, parts, columns, rows]
+    counts_array = array(counts, wp.int32)
+    launch_chunked(kernels.count_tiles, parts, inputs, [counts_array], device="cpu", minimum=1)
+    outputs = [counts_array, array(offsets, wp.int32), array(entries, wp.int64)]
+    launch_chunked(kernels.scan_tiles, 1, [], outputs, device="cpu")
+    ids = torch.empty(check_count("tile list entries", int(entries), limit), dtype=torch.int32)
+    outputs = [counts_array, array(ids, wp.int32)]
+    launch_chunked(kernels.fill_tiles, parts, inputs, outputs, device="cpu", minimum=1)
+    return TileLists(offsets, ids)
+
+
+def expand_and_sort(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
+    """Pairs in depth order, then a stable radix sort by tile; for GPUs."""
+    columns, rows = view.tiles
+    tiles = projection.cameras * rows * columns
+    total = len(projection.records)
+    device = projection.records.device
+    name = device_name(projection.records)
+    rects = array(projection.rects, wp.vec4i)
+    order = array(projection.order, wp.int32)
+    counts = torch.empty(total, dtype=torch.int32, device=device)
+    inputs = [order, rects, projection.gaussians]
+    launch_chunked(kernels.count_expansion, total, inputs, [array(counts, wp.int32)], device=name)
+    ends = torch.cumsum(counts, 0, dtype=torch.int64)
+    entries = check_count("tile list entries", int(ends[-1]), limit)
+    if entries == 0:
+        return empty_lists(projection.cameras, view, device)
+    begins = (ends - counts).to(torch.int32)
+    keys = torch.empty(2 * entries, dtype=torch.int32, device=device)
+    ids = torch.empty(2 * entries, dtype=torch.int32, device=device)
+    keys_array, ids_array = array(keys, wp.int32), array(ids, wp.int32)
+    inputs = [order, rects, projection.gaussians, array(begins, wp.int32), columns, rows]
+    launch_chunked(kernels.expand_tiles, total, inputs, [keys_array, ids_array], device=name)
+    bits = max(1, (tiles - 1).bit_length())
+    wp.utils.radix_sort_pairs(keys_array, ids_array, entries, end_bit=bits)
+    offsets = torch.empty(tiles + 1, dtype=torch.int32, device=device)
+    outputs = [array(offsets, wp.int32)]
+    launch_chunked(kernels.find_tiles, entries + 1, [keys_array, entries], outputs, device=name)
+    return TileLists(offsets, ids[:entries])
+
+
+__all__ = ["TileLists", "bin_tiles", "count_and_fill", "empty_lists", "expand_and_sort"]

@@ -1,0 +1,169 @@
+"""Lists of the Gaussians that touch each 16 x 16 pixel tile, front to back.
+
+The Gaussians come sorted by depth; only tiles remain to be told apart, so entries are never sorted by depth.
+On CPUs a counting sort: `count_tiles`, `scan_tiles`, `fill_tiles`, over ranges of Gaussians ("parts") whose
+counts are kept apart, so parts run in parallel and the lists do not depend on how many there are. On GPUs
+`expand_tiles` writes (tile, Gaussian) pairs in depth order, a stable radix sort by tile groups them, and
+`find_tiles` finds where each group begins. Both give the same lists.
+
+Tiles are numbered row by row, camera after camera.
+"""
+
+import warp as wp
+
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        "max_unroll": 0,
+        "default_grid_stride": False,
+        "cpu_compiler_flags": "-march=native",
+    }
+)
+
+
+@wp.func
+def sorted_gaussian(order: wp.array2d[int], count: int, i: int) -> int:
+    """Record number of the i-th Gaussian in depth order, camera after camera, `count` in each."""
+    camera = i / count
+    return order[camera, i - camera * count]
+
+
+@wp.kernel
+def count_tiles(
+    start: int,
+    # In:
+    order: wp.array2d[int],
+    rects: wp.array[wp.vec4i],
+    count: int,
+    parts: int,
+    tiles_x: int,
+    tiles_y: int,
+    # Out:
+    counts_out: wp.array2d[int],
+):
+    """Part p of the Gaussians: how many touch each tile. `counts_out` [parts, tiles] starts at zero."""
+    part = start + wp.tid()
+    total = wp.int64(rects.shape[0])
+    begin = int(total * wp.int64(part) / wp.int64(parts))
+    end = int(total * wp.int64(part + 1) / wp.int64(parts))
+    for i in range(begin, end):
+        g = sorted_gaussian(order, count, i)
+        rect = rects[g]
+        for y in range(rect[1], rect[3]):
+            row = (g / count * tiles_y + y) * tiles_x
+            for x in range(rect[0], rect[2]):
+                counts_out[part, row + x] = counts_out[part, row + x] + 1
+
+
+@wp.kernel
+def scan_tiles(
+    start: int,
+    # Out:
+    counts_out: wp.array2d[int],
+    offsets_out: wp.array[int],
+    total_out: wp.array[wp.int64],
+):
+    """Turn counts into where each (tile, part) begins; `offsets_out` [tiles + 1]. One index does it all."""
+    sum = wp.int64(0)
+    for tile in range(counts_out.shape[1]):
+        offsets_out[tile] = int(sum)
+        for part in range(counts_out.shape[0]):
+            here = counts_out[part, tile]
+            counts_out[part, tile] = int(sum)
+            sum += wp.int64(here)
+    offsets_out[counts_out.shape[1]] = int(sum)
+    total_out[start + wp.tid()] = sum
+
+
+@wp.kernel
+def fill_tiles(
+    start: int,
+    # In:
+    order: wp.array2d[int],
+    rects: wp.array[wp.vec4i],
+    count: int,
+    parts: int,
+    tiles_x: int,
+    tiles_y: int,
+    # Out:
+    next_out: wp.array2d[int],
+    ids_out: wp.array[int],
+):
+    """Part p of the Gaussians: write each into the lists of its tiles, from `next_out` [parts, tiles] on."""
+    part = start + wp.tid()
+    total = wp.int64(rects.shape[0])
+    begin = int(total * wp.int64(part) / wp.int64(parts))
+    end = int(total * wp.int64(part + 1) / wp.int64(parts))
+    for i in range(begin, end):
+        g = sorted_gaussian(order, count, i)
+        rect = rects[g]
+        for y in range(rect[1], rect[3]):
+            row = (g / count * tiles_y + y) * tiles_x
+            for x in range(rect[0], rect[2]):
+                at = next_out[part, row + x]
+                ids_out[at] = g
+                next_out[part, row + x] = at + 1
+
+
+@wp.kernel
+def count_expansion(
+    start: int,
+    # In:
+    order: wp.array2d[int],
+    rects: wp.array[wp.vec4i],
+    count: int,
+    # Out:
+    counts_out: wp.array[int],
+):
+    """How many tiles the i-th Gaussian in depth order touches."""
+    i = start + wp.tid()
+    rect = rects[sorted_gaussian(order, count, i)]
+    counts_out[i] = (rect[2] - rect[0]) * (rect[3] - rect[1])
+
+
+@wp.kernel
+def expand_tiles(
+    start: int,
+    # In:
+    order: wp.array2d[int],
+    rects: wp.array[wp.vec4i],
+    count: int,
+    begins: wp.array[int],
+    tiles_x: int,
+    tiles_y: int,
+    # Out:
+    tiles_out: wp.array[int],
+    ids_out: wp.array[int],
+):
+    """Write (tile, Gaussian) for each tile of the i-th Gaussian in depth order, from `begins[i]` on."""
+    i = start + wp.tid()
+    g = sorted_gaussian(order, count, i)
+    rect = rects[g]
+    at = begins[i]
+    for y in range(rect[1], rect[3]):
+        row = (g / count * tiles_y + y) * tiles_x
+        for x in range(rect[0], rect[2]):
+            tiles_out[at] = row + x
+            ids_out[at] = g
+            at += 1
+
+
+@wp.kernel
+def find_tiles(
+    start: int,
+    # In:
+    tiles: wp.array[int],
+    entries: int,
+    # Out:
+    offsets_out: wp.array[int],
+):
+    """Where each tile's group begins in the sorted `tiles`; index runs over entries + 1 boundaries."""
+    i = start + wp.tid()
+    before = int(-1)
+    if i > 0:
+        before = tiles[i - 1]
+    here = offsets_out.shape[0] - 1
+    if i < entries:
+        here = tiles[i]
+    for tile in range(before + 1, here + 1):
+        offsets_out[tile] = i
