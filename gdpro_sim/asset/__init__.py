@@ -1,1 +1,6 @@
+"""Assets: bound Gaussians with everything simulation needs, in one USD file."""
 
+from gdpro_sim.asset.asset import Asset
+from gdpro_sim.asset.stage import is_asset, kind
+
+__all__ = ["Asset", "is_asset", "kind"]
