@@ -81,7 +81,7 @@ def piola_stress(F: wp.mat33d, mu: wp.float64, lam: wp.float64) -> wp.mat33d:
 
 @wp.func
 def jacobi_rotation(app: wp.float64, aqq: wp.float64, apq: wp.float64):
-    """Cosine and sine of the rotation that zeroes a symmetric 2x2's off-diagonal (Golub & Van Loan, 8.5.2)."""
+    """Cosine and sine of the rotation that diagonalises a symmetric 2x2 (Golub & Van Loan, 8.5.2)."""
     c = wp.float64(1.0)
     s = wp.float64(0.0)
     if apq != wp.float64(0.0):

@@ -15,7 +15,7 @@ def tet_box(
     size: tuple[float, float, float],
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A box of cells, each cut into 6 tets (Kuhn): vertices [P, 3] float64, tets [T, 4] int32, volumes > 0."""
+    """A box of cells, 6 tets each (Kuhn): vertices [P, 3] float64, tets [T, 4] int32, volumes > 0."""
     nx, ny, nz = cells
     axes = [np.linspace(0.0, s, n + 1) + o for n, s, o in zip(cells, size, origin, strict=True)]
     vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

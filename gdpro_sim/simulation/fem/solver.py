@@ -244,8 +244,8 @@ class SolverFEM:
                 raise SolverError(f"the saved FEM state has no {name!r}; it must hold {', '.join(shapes)}")
             if state[name].shape != shape:
                 raise SolverError(
-                    f"the saved FEM state's {name!r} has shape {state[name].shape}, this model needs {shape}: "
-                    "it was saved from another scene"
+                    f"the saved FEM state's {name!r} has shape {state[name].shape}, this model "
+                    f"needs {shape}: it was saved from another scene"
                 )
         self._set_state(state["positions"], state["velocities"], state["anchors"])
         self._time = float(state["time"])

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Element blocks are stored row by row for a <= b: (0,0) (0,1) (0,2) (0,3) (1,1) (1,2) (1,3) (2,2) (2,3) (3,3).
+# Element blocks are stored row by row for a <= b:
+# (0,0) (0,1) (0,2) (0,3) (1,1) (1,2) (1,3) (2,2) (2,3) (3,3).
 UPPER_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 UPPER_SLOTS = (1, 2, 3, 5, 6, 8)
 BLOCKS_PER_ELEMENT = 10
