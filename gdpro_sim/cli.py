@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn  # fmt: skip
 from rich.table import Table
+from typer.exceptions import TyperException
 
 import gdpro_sim
 from gdpro_sim.errors import GdproError, RequestError
@@ -95,13 +96,21 @@ def _table(title: str, rows: list[tuple[str, str]]) -> None:
 def import_command(
     mesh: Annotated[Path, typer.Argument(help="Mesh file: OBJ, PLY, STL, glTF/GLB, OFF, DAE, USD …")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Asset to write: .usdc, .usda or .usdz.")],
-    budget: Annotated[int, typer.Option("--budget", min=100, max=5_000_000, help="Gaussians to aim for.")] = 50_000,
+    budget: Annotated[
+        int, typer.Option("--budget", min=100, max=5_000_000, help="Gaussians to aim for.")
+    ] = 50_000,
     color: Color = None,
     texture: Annotated[Path | None, typer.Option("--texture", help="Texture image of the mesh.")] = None,
     up: Annotated[str, typer.Option("--up", help="Up axis of the file: auto, y or z.")] = "auto",
-    scale: Annotated[float | None, typer.Option("--scale", help="Multiply lengths, e.g. 0.001 for mm.")] = None,
-    material: Annotated[str | None, typer.Option("--material", help="Material preset stored in the asset.")] = None,
-    tets: Annotated[int, typer.Option("--tets", min=0, max=500_000, help="Tetrahedra to aim for; 0 for none.")] = 6_000,
+    scale: Annotated[
+        float | None, typer.Option("--scale", help="Multiply lengths, e.g. 0.001 for mm.")
+    ] = None,
+    material: Annotated[
+        str | None, typer.Option("--material", help="Material preset stored in the asset.")
+    ] = None,
+    tets: Annotated[
+        int, typer.Option("--tets", min=0, max=500_000, help="Tetrahedra to aim for; 0 for none.")
+    ] = 6_000,
     seed: Seed = None,
     json_output: AsJson = False,
     quiet: Quiet = False,
@@ -148,7 +157,9 @@ def simulate(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
     device: Device = "auto",
     seed: Seed = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Start again instead of continuing a stopped run.")] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Start again instead of continuing a stopped run.")
+    ] = False,
     json_output: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -176,7 +187,10 @@ def simulate(
             ("video", str(recording.video)),
             ("contact sheet", str(recording.contact_sheet)),
             ("metrics", str(recording.metrics)),
-            ("frames", f"{recording.frames}  ({recording.frame_count}, {recording.resumed_frames} of them resumed)"),
+            (
+                "frames",
+                f"{recording.frames}  ({recording.frame_count}, {recording.resumed_frames} of them resumed)",
+            ),
             ("size", f"{recording.gaussians:,} Gaussians, {recording.tets:,} tetrahedra"),
             ("seconds", "  ".join(f"{phase} {value:.1f}" for phase, value in recording.seconds.items())),
         ]
@@ -187,7 +201,9 @@ def simulate(
 def render(
     file: Annotated[Path, typer.Argument(help="Asset or simulation (.usdc, .usda, .usdz).")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the pictures.")],
-    frames: Annotated[int, typer.Option("--frames", min=1, max=10_000, help="Views of an asset's turntable.")] = 24,
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, max=10_000, help="Views of an asset's turntable.")
+    ] = 24,
     width: Annotated[int, typer.Option("--width", min=16, max=8192)] = 960,
     height: Annotated[int, typer.Option("--height", min=16, max=8192)] = 720,
     azimuth: Annotated[float, typer.Option("--azimuth", help="Degrees from +X.")] = -60.0,
@@ -240,11 +256,16 @@ def scenes(json_output: AsJson = False, debug: Debug = False) -> None:
     from gdpro_sim.simulation.scene import load_scene, scene_names
 
     listing = {name: load_scene(name).description for name in scene_names()}
-    _show(listing, "Shipped scenes", json_output, False)
+    if json_output:
+        print(json.dumps(listing))
+    else:
+        _table("Shipped scenes", list(listing.items()))
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
     if version:
         print(gdpro_sim.__version__)
         raise typer.Exit
@@ -276,15 +297,26 @@ def main() -> None:
     """Entry point: one line per error; exit code 0, 1 (failed run), 2 (wrong request) or 130 (Ctrl-C)."""
     debug = "--debug" in sys.argv
     try:
-        app()
+        code = app(standalone_mode=False) or 0
+        if code == 130:  # typer turns Ctrl-C into this exit code
+            raise KeyboardInterrupt
+        sys.exit(code)
+    except TyperException as error:
+        if not error.format_message():  # the help text was printed instead
+            sys.exit(2)
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "gdpro"
+        print(f"gdpro: {error.format_message()} (see `{command} --help`)", file=sys.stderr)
+        sys.exit(2)
     except GdproError as error:
         if debug:
             traceback.print_exc()
         for line in str(error).splitlines():
             print(f"gdpro: {line}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("gdpro: interrupted; finished frames are kept, the same command continues", file=sys.stderr)
+    except (KeyboardInterrupt, typer.Abort):
+        kept = "; finished frames are kept, the same command continues" if "simulate" in sys.argv else ""
+        print(f"gdpro: interrupted{kept}", file=sys.stderr)
         sys.exit(130)
     except MemoryError:
         print("gdpro: out of memory; lower --budget or the number of tetrahedra", file=sys.stderr)

@@ -9,6 +9,8 @@ must write memory no other index writes (plain Warp atomics are not atomic on th
 from __future__ import annotations
 
 import os
+import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -17,7 +19,31 @@ import warp as wp
 
 from gdpro_sim.errors import DeviceError
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
+
+
+def _start_warp() -> None:
+    """Initialise Warp without its native notice that a machine has no CUDA driver (many of our users' have none)."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # no standard error to keep clean
+        wp.init()
+        return
+    with tempfile.TemporaryFile() as caught:
+        sys.stderr.flush()
+        os.dup2(caught.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            caught.seek(0)
+            for line in caught.read().decode(errors="replace").splitlines():
+                if "Could not find or load the NVIDIA CUDA driver" not in line:
+                    print(line, file=sys.stderr)
+
+
+_start_warp()
 
 _threads: int | None = None
 _pool: ThreadPoolExecutor | None = None
@@ -29,7 +55,6 @@ def resolve_device(device: str = "auto") -> str:
     `"auto"` is the first CUDA device where there is one, else the CPU. Raises `DeviceError` when the
     named device does not exist on this machine; never falls back to another.
     """
-    wp.init()
     cuda = [d.alias for d in wp.get_cuda_devices()]
     if device == "auto":
         return cuda[0] if cuda else "cpu"

@@ -34,6 +34,19 @@ def check_writable(path: str | Path) -> Path:
     return target
 
 
+def prepare_folder(folder: str | Path, file: str) -> Path:
+    """Make the folder (and its parents) and check that `file` can be written in it. Raises RequestError."""
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise RequestError(f"output {path} is, or lies in, a file; give a folder") from None
+    except OSError as error:
+        raise RequestError(f"output folder {path} cannot be made: {error.strerror or error}") from None
+    check_writable(path / file)
+    return path
+
+
 def temporary_beside(target: Path) -> Path:
     """A fresh hidden name in the folder of `target`, with its suffix (writers pick the format by suffix)."""
     return target.with_name(f".{target.stem}.{secrets.token_hex(6)}.tmp{target.suffix}")
@@ -103,6 +116,7 @@ __all__ = [
     "check_writable",
     "commit_file",
     "output_error",
+    "prepare_folder",
     "remove_quietly",
     "sha256_of",
     "temporary_beside",

@@ -43,13 +43,17 @@ def test_rest_vertices_give_the_rest_gaussians_bit_for_bit() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_matches_the_float64_reference_on_random_deformations(seed: int) -> None:
     bound = make_bound(seed, degree=2)
-    moved = bound.vertices + 0.4 * torch.randn(bound.vertices.shape, generator=torch.Generator().manual_seed(seed))
+    moved = bound.vertices + 0.4 * torch.randn(
+        bound.vertices.shape, generator=torch.Generator().manual_seed(seed)
+    )
     got = bound.gaussians(moved)
     means, covariance, sh = follow(bound, moved)
     np.testing.assert_allclose(got.means.numpy(), means, atol=2e-6)
     size = np.linalg.norm(covariance, axis=(1, 2), keepdims=True)
     error = np.abs(covariances(got) - covariance) / size
-    assert np.quantile(error, 0.99) < 1e-4 and error.max() < 1e-2  # the tail: nearly flat triangles in float32
+    assert (
+        np.quantile(error, 0.99) < 1e-4 and error.max() < 1e-2
+    )  # the tail: nearly flat triangles in float32
     error = np.abs(got.sh.numpy() - sh)
     assert np.quantile(error, 0.99) < 1e-3
 

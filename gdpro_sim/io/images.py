@@ -46,7 +46,12 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float) ->
 
 
 def write_contact_sheet(
-    path: str | Path, pictures: Sequence[np.ndarray], labels: Sequence[str], *, columns: int = 4, width: int = 1600
+    path: str | Path,
+    pictures: Sequence[np.ndarray],
+    labels: Sequence[str],
+    *,
+    columns: int = 4,
+    width: int = 1600,
 ) -> None:
     """Write a grid of pictures with a label in each corner. Raises OutputError."""
     cell_w = width // columns

@@ -20,8 +20,9 @@ from gdpro_sim.gaussians import SH_C0, Gaussians
 from gdpro_sim.splatting import rasterization
 
 GAMMA = 2.2
-MAP_SIZE = 224
-KEY_SHARE = 0.62
+MAP_SIZE = 160
+FLOOR_SIZE = 224
+KEY_SHARE = 0.66
 BOUNCE = 0.10
 GLOSS = 0.16
 
@@ -57,8 +58,8 @@ def _lights(azimuth: int) -> tuple[np.ndarray, np.ndarray]:
         weights.append(weight / math.sin(e))
 
     for turn, lift in ((-5.0, -3.0), (5.0, -4.0), (-4.0, 4.0), (4.0, 5.0)):
-        add(azimuth - 48.0 + turn, 50.0 + lift, KEY_SHARE / 4.0)
-    ring = ((20.0, 4, 0.25), (48.0, 3, 0.45), (80.0, 1, 0.3))
+        add(azimuth - 48.0 + turn, 47.0 + lift, KEY_SHARE / 4.0)
+    ring = ((22.0, 5, 0.3), (50.0, 4, 0.45), (82.0, 1, 0.25))
     for elevation, count, share in ring:
         for k in range(count):
             add(azimuth + 30.0 + 360.0 * (k + 0.5) / count, elevation, (1.0 - KEY_SHARE) * share / count)
@@ -146,8 +147,38 @@ def light(gaussians: Gaussians, normals: torch.Tensor, cameras: Cameras) -> tupl
     return replace(gaussians, sh=sh), maps
 
 
-def _floor_and_sky(cameras: Cameras, studio: Studio, maps: _ShadowMaps | None, device: torch.device) -> torch.Tensor:
-    """What lies behind the Gaussians of the first camera, [H, W, 3] display colours."""
+@dataclass(frozen=True)
+class _Backdrop:
+    """What lies behind the Gaussians and does not change while the camera stands still.
+
+    sky:    [H, W, 3] what is seen where there is no floor
+    base:   [H, W, 3] the floor in full light, grid included
+    fade:   [H, W, 1] how much of the floor shows before it melts into the sky
+    uv:     [H, W, 2] where a pixel's floor point lies in the floor's shade map
+    centre: [2] m, half: m; the square the shade map covers
+    """
+
+    sky: torch.Tensor
+    base: torch.Tensor
+    fade: torch.Tensor
+    uv: torch.Tensor
+    centre: torch.Tensor
+    half: float
+
+    def picture(self, maps: _ShadowMaps | None, height: float) -> torch.Tensor:
+        """The backdrop under the shadows of `maps`, [H, W, 3]."""
+        base = self.base
+        if maps is not None:
+            shade = _floor_shade(maps, self.centre, self.half, height)
+            sampled = torch.nn.functional.grid_sample(
+                shade[None, None], self.uv[None], padding_mode="border", align_corners=False
+            )
+            base = base * sampled[0, 0, :, :, None]
+        return self.sky + (base - self.sky) * self.fade
+
+
+def _backdrop(cameras: Cameras, studio: Studio, device: torch.device) -> _Backdrop | torch.Tensor:
+    """Floor and sky of the first camera, or a plain colour [H, W, 3]."""
     h, w = cameras.height, cameras.width
     if studio.background != "studio":
         return torch.full((h, w, 3), 1.0 if studio.background == "white" else 0.0, device=device)
@@ -159,40 +190,50 @@ def _floor_and_sky(cameras: Cameras, studio: Studio, maps: _ShadowMaps | None, d
     rays = torch.nn.functional.normalize(local @ view[:3, :3], dim=-1)
     eye = cameras.positions[0].to(device)
     lift = rays[..., 2:3]
-    top, horizon = torch.tensor([0.80, 0.85, 0.90], device=device), torch.tensor([0.95, 0.955, 0.96], device=device)
+    top, horizon = (
+        torch.tensor([0.80, 0.85, 0.90], device=device),
+        torch.tensor([0.95, 0.955, 0.96], device=device),
+    )
     sky = horizon + (top - horizon) * lift.clamp(0.0, 1.0).pow(0.7)
     if studio.ground is None or float(eye[2]) <= studio.ground:
         return sky
-    t = (studio.ground - eye[2]) / torch.where(lift < -1e-4, lift, torch.full_like(lift, -1e-4))
-    hit = eye + rays * t
-    reach = torch.linalg.norm(hit[..., :2] - _looked_at(cameras, studio), dim=-1, keepdim=True)
-    base = torch.tensor([0.835, 0.845, 0.855], device=device)
+    below = lift < -1e-4
+    t = (studio.ground - eye[2]) / torch.where(below, lift, torch.full_like(lift, -1e-4))
+    hit = (eye + rays * t)[..., :2]
+    centre = _looked_at(cameras, studio).to(device)
+    reach = torch.linalg.norm(hit - centre, dim=-1, keepdim=True)
+    base = torch.tensor([0.835, 0.845, 0.855], device=device).expand(h, w, 3)
     spacing = 10.0 ** math.floor(math.log10(max(studio.scale, 1e-6) * 0.8))
-    foot = 0.75 * (t / k[1, 1]) / (-lift).clamp_min(0.02)
-    for step, width, strength in ((spacing, 0.008, 0.05), (5.0 * spacing, 0.012, 0.10)):
-        nearest = (hit[..., :2] / step - torch.round(hit[..., :2] / step)).abs() * step
-        half = 0.5 * width * spacing * 2.0
+    foot = 0.75 * (t / k[1, 1]) / (-lift).clamp_min(0.02)  # metres of floor under a pixel
+    for step, half, strength in ((spacing, 0.008 * spacing, 0.05), (5.0 * spacing, 0.012 * spacing, 0.10)):
+        nearest = (hit / step - torch.round(hit / step)).abs() * step
         cover = ((half + 0.5 * foot - nearest) / foot).clamp(0.0, 1.0) * (2.0 * half / foot).clamp(max=1.0)
         base = base - strength * (1.0 - (1.0 - cover).prod(-1, keepdim=True))
-    if maps is not None:
-        directions, weights = _lights_of(maps, cameras, device)
-        near = reach[..., 0] < 8.0 * studio.scale
-        near &= lift[..., 0] < -1e-4
-        shade = torch.ones((h, w), device=device)
-        points = hit[near]
-        if len(points):
-            received = (weights[:, None] * directions[:, 2:3].clamp_min(0.0) * maps.visibility(points)).sum(0)
-            shade[near] = received.clamp(0.0, 1.0).pow(1.0 / GAMMA)
-        base = base * (0.10 + 0.90 * shade[..., None])
-    fade = torch.exp(-((reach / (5.0 * studio.scale)) ** 2))
-    floor = horizon + (base - horizon) * fade
-    return torch.where(lift < -1e-4, floor, sky)
+    fade = torch.exp(-((reach / (5.0 * studio.scale)) ** 2)) * below
+    half = 3.0 * studio.scale
+    return _Backdrop(sky, base, fade, (hit - centre) / half, centre, half)
 
 
-def _lights_of(maps: _ShadowMaps, cameras: Cameras, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+def _floor_shade(maps: _ShadowMaps, centre: torch.Tensor, half: float, height: float) -> torch.Tensor:
+    """Brightness of the floor under the lights on a square around `centre`, [S, S], display-referred."""
+    device = centre.device
+    steps = (torch.arange(FLOOR_SIZE, device=device) + 0.5) / FLOOR_SIZE * 2.0 - 1.0
+    y, x = torch.meshgrid(steps, steps, indexing="ij")
+    points = torch.stack(
+        [centre[0] + half * x, centre[1] + half * y, torch.full_like(x, height)], -1
+    ).reshape(-1, 3)
     directions = -maps.cameras.viewmats[:, 2, :3].to(device)
-    weights = torch.tensor(_lights(0)[1], dtype=torch.float32, device=device)
-    return directions, weights
+    weights = torch.tensor(_lights(0)[1], dtype=torch.float32, device=device) * directions[:, 2]
+    visible = (weights[:, None] * maps.visibility(points)).reshape(-1, FLOOR_SIZE, FLOOR_SIZE)
+    key, sky = visible[:4].sum(0), visible[4:].sum(0)
+    # A few sky lights stand for the whole sky: blur what they draw, not the key light's shadow.
+    offsets = torch.arange(-7, 8, device=device)
+    kernel = torch.exp(-0.5 * (offsets / 3.0) ** 2)
+    kernel = kernel / kernel.sum()
+    padded = torch.nn.functional.pad(sky[None, None], (7, 7, 7, 7), mode="replicate")
+    sky = torch.nn.functional.conv2d(padded, kernel.view(1, 1, 1, -1))
+    sky = torch.nn.functional.conv2d(sky, kernel.view(1, 1, -1, 1))[0, 0]
+    return 0.08 + 0.92 * (key + sky).clamp(0.0, 1.0).pow(1.0 / GAMMA)
 
 
 def _looked_at(cameras: Cameras, studio: Studio) -> torch.Tensor:
@@ -204,26 +245,26 @@ def _looked_at(cameras: Cameras, studio: Studio) -> torch.Tensor:
     return (eye + forward * t)[:2]
 
 
-def render(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    *,
-    normals: torch.Tensor | None = None,
-    studio: Studio | None = None,
-) -> np.ndarray:
-    """Pictures of `gaussians`, uint8 [C, H, W, 3].
+class Renderer:
+    """Draws frames from fixed cameras; what does not change between frames is made once.
 
-    normals: [N, 3] unit, needed for studio shading. Cameras are lit one by one, so batching saves nothing here.
+    cameras: any number; each is lit for its own side
     """
-    studio = studio or Studio()
-    device = gaussians.means.device
-    pictures = []
-    for index in range(len(cameras)):
-        one = replace(cameras, viewmats=cameras.viewmats[index : index + 1], Ks=cameras.Ks[index : index + 1])
+
+    def __init__(self, cameras: Cameras, studio: Studio | None = None) -> None:
+        self.studio = studio or Studio()
+        self.cameras = [
+            replace(cameras, viewmats=cameras.viewmats[i : i + 1], Ks=cameras.Ks[i : i + 1])
+            for i in range(len(cameras))
+        ]
+        self._backdrops: dict[tuple[int, str], _Backdrop | torch.Tensor] = {}
+
+    def render(self, gaussians: Gaussians, normals: torch.Tensor, camera: int = 0) -> np.ndarray:
+        """One picture, uint8 [H, W, 3]. normals: [N, 3] unit, used by studio shading."""
+        device = gaussians.means.device
+        one = self.cameras[camera]
         lit, maps = gaussians, None
-        if studio.shading == "studio" and len(gaussians):
-            if normals is None:
-                raise ValueError("studio shading needs `normals` [N, 3]")
+        if self.studio.shading == "studio" and len(gaussians):
             lit, maps = light(gaussians, normals, one)
         color, alpha, _ = rasterization(
             lit.means,
@@ -237,10 +278,14 @@ def render(
             one.height,
             sh_degree=lit.sh_degree,
         )
-        behind = _floor_and_sky(one, studio, maps, device)
-        picture = color[0] + (1.0 - alpha[0]) * behind
-        pictures.append((picture.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
-    return np.stack(pictures)
+        key = (camera, str(device))
+        if key not in self._backdrops:
+            self._backdrops[key] = _backdrop(one, self.studio, device)
+        backdrop = self._backdrops[key]
+        if isinstance(backdrop, _Backdrop):
+            backdrop = backdrop.picture(maps, float(self.studio.ground or 0.0))
+        picture = color[0] + (1.0 - alpha[0]) * backdrop
+        return (picture.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
 
 
 def frame_camera(
@@ -264,7 +309,9 @@ def frame_camera(
         direction = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
         right = np.array([-math.sin(a), math.cos(a), 0.0])
         upward = np.cross(direction, right)
-        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        corners = np.array(
+            [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+        )
         offset = corners - centre
         tan_v = math.tan(0.5 * vertical)
         tan_h = tan_v * width / height
@@ -275,4 +322,4 @@ def frame_camera(
     return Cameras.look_at([eye], centre, vertical_fov=vertical, width=width, height=height)
 
 
-__all__ = ["Studio", "frame_camera", "light", "render"]
+__all__ = ["Renderer", "Studio", "frame_camera", "light"]

@@ -23,11 +23,11 @@ import torch
 import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.errors import OutputError, RequestError
-from gdpro_sim.files import atomic_write, check_writable, sha256_of
+from gdpro_sim.errors import OutputError
+from gdpro_sim.files import atomic_write, prepare_folder, sha256_of
 from gdpro_sim.io.images import read_png, spread, write_contact_sheet, write_png, write_video
-from gdpro_sim.io.preview import Studio, frame_camera, render
-from gdpro_sim.io.usd import SimulationWriter
+from gdpro_sim.io.preview import Renderer, Studio, frame_camera
+from gdpro_sim.io.usd import SimulationWriter, body_records
 from gdpro_sim.simulation.compile import load_assets
 from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.model import Diagnostics
@@ -79,8 +79,7 @@ def record(
     frames stay on disk and the next call continues after them.
     """
     checked = scene if isinstance(scene, Scene) else load_scene(scene)
-    folder = Path(output)
-    _prepare_folder(folder)
+    folder = prepare_folder(output, "simulation.usdc")
     store = _Store(folder / ".resume", _fingerprint(checked, device), fresh)
     report = on_progress or (lambda phase, done, total: None)
     seconds: dict[str, float] = {}
@@ -97,10 +96,10 @@ def record(
     simulation = Simulation(checked, assets, device=device)
     seconds["prepare"] = time.perf_counter() - begin
 
-    cameras, studio = _camera(checked, simulation), _studio(checked, simulation)
+    renderer = Renderer(_camera(checked, simulation), _studio(checked, simulation))
     frames = folder / "frames"
     frames.mkdir(exist_ok=True)
-    rows = _run(simulation, folder, store, cameras, studio, report)
+    rows = _run(simulation, folder, store, renderer, report)
 
     begin = time.perf_counter()
     pictures = [frames / _frame_name(i) for i in range(len(simulation))]
@@ -112,7 +111,9 @@ def record(
     write_contact_sheet(folder / "contact_sheet.png", [read_png(pictures[i]) for i in chosen], labels)
     _write_metrics(folder / "metrics.csv", rows)
     report("video", 1, 1)
-    seconds.update({phase: sum(row[f"ms_{phase}"] for row in rows[store.resumed :]) / 1e3 for phase in PHASES})
+    seconds.update(
+        {phase: sum(row[f"ms_{phase}"] for row in rows[store.resumed :]) / 1e3 for phase in PHASES}
+    )
     seconds["video"] = time.perf_counter() - begin
     store.finish()
     return Recording(
@@ -135,8 +136,7 @@ def _run(
     simulation: Simulation,
     folder: Path,
     store: _Store,
-    cameras: Cameras,
-    studio: Studio,
+    renderer: Renderer,
     report: Progress,
 ) -> list[dict[str, Any]]:
     """Every frame: solve (or take it from an interrupted run), re-splat, draw, write."""
@@ -144,7 +144,15 @@ def _run(
     rows: list[dict[str, Any]] = []
     report("simulate", 0, total)
     simulation.solver.reset()
-    with SimulationWriter(folder / "simulation.usdc", simulation.scene.fps, simulation.model.bodies) as writer:
+    scene = simulation.scene
+    with SimulationWriter(
+        folder / "simulation.usdc",
+        scene.fps,
+        body_records(simulation.model, simulation.assets),
+        metadata={"scene": scene.model_dump(mode="json"), "version": gdpro_sim.__version__},
+        gravity=scene.gravity,
+        ground=None if scene.ground is None else scene.ground.height,
+    ) as writer:
         for index in range(total):
             stored = store.load(index)
             if stored is None:
@@ -160,7 +168,7 @@ def _run(
             path = folder / "frames" / _frame_name(index)
             picture = None
             if stored is None or not path.exists():
-                picture = render(frame.gaussians(), cameras, normals=_normals(simulation, frame), studio=studio)[0]
+                picture = renderer.render(frame.gaussians(), _normals(simulation, frame))
             drawn = time.perf_counter()
             if picture is not None:
                 write_png(path, picture)
@@ -206,7 +214,9 @@ def _row(index: int, diagnostics: Diagnostics, milliseconds: dict[str, float]) -
     for key, value in asdict(diagnostics).items():
         if key in ("momentum", "angular_momentum"):
             unit = "kg_m_per_s" if key == "momentum" else "kg_m2_per_s"
-            row.update({f"{key}_{axis}_{unit}": component for axis, component in zip("xyz", value, strict=True)})
+            row.update(
+                {f"{key}_{axis}_{unit}": component for axis, component in zip("xyz", value, strict=True)}
+            )
         else:
             row[units.get(key, key)] = value
     row.update({f"ms_{phase}": round(value, 3) for phase, value in milliseconds.items()})
@@ -260,16 +270,6 @@ def _studio(scene: Scene, simulation: Simulation) -> Studio:
 def _save_assets(assets: dict[str, Asset], names: list[str], paths: list[Path]) -> None:
     for name, path in zip(names, paths, strict=True):
         assets[name].save(path)
-
-
-def _prepare_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise RequestError(f"output {folder} is a file; give a folder") from None
-    except OSError as error:
-        raise RequestError(f"output folder {folder} cannot be written: {error.strerror or error}") from None
-    check_writable(folder / "simulation.usdc")
 
 
 def _fingerprint(scene: Scene, device: str) -> str:
@@ -333,14 +333,18 @@ class _Store:
             return None
         try:
             with np.load(path, allow_pickle=False) as data:
-                surfaces = [data[f"surface.{k}"] for k in range(sum(n.startswith("surface.") for n in data.files))]
+                surfaces = [
+                    data[f"surface.{k}"] for k in range(sum(n.startswith("surface.") for n in data.files))
+                ]
                 state = {n.removeprefix("state."): data[n] for n in data.files if n.startswith("state.")}
                 figures = json.loads(str(data["figures"]))
         except (OSError, ValueError, KeyError) as error:
             logger.warning("%s cannot be read (%s); continuing from the frame before it", path, error)
             self._open = False
             return None
-        figures["diagnostics"] = {k: tuple(v) if isinstance(v, list) else v for k, v in figures["diagnostics"].items()}
+        figures["diagnostics"] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in figures["diagnostics"].items()
+        }
         self.resumed = index + 1
         return surfaces, Diagnostics(**figures["diagnostics"]), figures["solve"], state
 
@@ -353,7 +357,9 @@ class _Store:
         state: dict[str, np.ndarray],
     ) -> None:
         figures = json.dumps({"diagnostics": asdict(diagnostics), "solve": solve})
-        arrays = {f"surface.{k}": s for k, s in enumerate(surfaces)} | {f"state.{k}": v for k, v in state.items()}
+        arrays = {f"surface.{k}": s for k, s in enumerate(surfaces)} | {
+            f"state.{k}": v for k, v in state.items()
+        }
         with atomic_write(self.folder / f"frame_{index:05d}.npz") as temporary:
             np.savez(temporary, figures=np.array(figures), **arrays)  # type: ignore[arg-type]
 

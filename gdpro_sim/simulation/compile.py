@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gdpro_sim.asset import Asset, import_mesh, is_asset, tetrahedralize_asset
+from gdpro_sim.asset import Asset, import_mesh, kind, tetrahedralize_asset
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.simulation.model import Body, FemSettings, Ground, Model
@@ -42,7 +42,7 @@ def load_assets(
             raise SceneError(f"{scene.name}: bodies[{body.name}].asset: {path}: no such file")
         if on_progress:
             on_progress(f"preparing {body.name}")
-        if is_asset(path):
+        if kind(path) == "asset":
             ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
             if ignored:
                 raise SceneError(

@@ -38,17 +38,25 @@ class Pins(_Strict):
 class SceneBody(_Strict):
     """One soft body."""
 
-    name: str = Field(default="", pattern=r"^([A-Za-z_][A-Za-z0-9_]*)?$", description="unique; default: from the file")
+    name: str = Field(
+        default="", pattern=r"^([A-Za-z_][A-Za-z0-9_]*)?$", description="unique; default: from the file"
+    )
     asset: str = Field(
         min_length=1,
         description="asset (.usdc, .usda, .usdz) or mesh file, relative to the scene file; "
         "`package:NAME/PATH` is a file inside an installed Python package",
     )
     color: str | None = Field(default=None, description="colour of a mesh, #rrggbb or a CSS name")
-    texture: str | None = Field(default=None, description="texture image of a mesh, relative to the scene file")
-    budget: int = Field(default=50_000, ge=100, le=5_000_000, description="Gaussians to aim for when a mesh is bound")
+    texture: str | None = Field(
+        default=None, description="texture image of a mesh, relative to the scene file"
+    )
+    budget: int = Field(
+        default=50_000, ge=100, le=5_000_000, description="Gaussians to aim for when a mesh is bound"
+    )
     up: Literal["auto", "y", "z"] = Field(default="auto", description="up axis of a mesh file")
-    tets: int = Field(default=6_000, ge=50, le=500_000, description="tetrahedra to aim for, where none are cached")
+    tets: int = Field(
+        default=6_000, ge=50, le=500_000, description="tetrahedra to aim for, where none are cached"
+    )
     size: float | None = Field(default=None, gt=0.0, description="longest side of the bounding box, m")
     scale: float = Field(default=1.0, gt=0.0, description="uniform scale, where size is not given")
     anchor: Literal["bottom", "center", "origin"] = Field(
@@ -58,7 +66,9 @@ class SceneBody(_Strict):
     rotation: Vector = Field(default=(0.0, 0.0, 0.0), description="degrees about X, then Y, then Z")
     velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="m/s")
     angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="rad/s about the body's centre")
-    material: Material | None = Field(default=None, description="preset name or values; default: the asset's, else jelly")
+    material: Material | None = Field(
+        default=None, description="preset name or values; default: the asset's, else jelly"
+    )
     pins: Pins | None = Field(default=None, description="box of vertices that never move")
 
     @model_validator(mode="before")
@@ -99,7 +109,9 @@ class Camera(_Strict):
 class Render(_Strict):
     """How the preview looks."""
 
-    shading: Literal["studio", "none"] = Field(default="studio", description="studio lights and shadows, or raw colours")
+    shading: Literal["studio", "none"] = Field(
+        default="studio", description="studio lights and shadows, or raw colours"
+    )
     background: Literal["studio", "white", "black"] = "studio"
 
 
@@ -110,8 +122,12 @@ class SolverOptions(_Strict):
     substeps: int = Field(default=2, ge=1, le=1000, description="implicit steps per frame at least")
     newton_iterations: int = Field(default=8, ge=1, le=1000, description="at most, per substep")
     newton_tolerance: float = Field(default=1e-3, gt=0.0, description="largest vertex speed correction, m/s")
-    cg_tolerance: float = Field(default=1e-2, gt=0.0, lt=1.0, description="relative residual of inner conjugate gradients")
-    contact_stiffness: float = Field(default=1.0, gt=0.0, description="multiple of the automatic ground stiffness")
+    cg_tolerance: float = Field(
+        default=1e-2, gt=0.0, lt=1.0, description="relative residual of inner conjugate gradients"
+    )
+    contact_stiffness: float = Field(
+        default=1.0, gt=0.0, description="multiple of the automatic ground stiffness"
+    )
 
 
 class Scene(_Strict):
@@ -128,7 +144,9 @@ class Scene(_Strict):
     camera: Camera = Field(default_factory=Camera)
     render: Render = Field(default_factory=Render)
     solver: SolverOptions = Field(default_factory=SolverOptions)
-    folder: Path = Field(default_factory=Path.cwd, exclude=True, description="where relative paths start; set by load_scene")
+    folder: Path = Field(
+        default_factory=Path.cwd, exclude=True, description="where relative paths start; set by load_scene"
+    )
 
     @model_validator(mode="after")
     def _unique_names(self) -> Scene:
@@ -173,8 +191,12 @@ def load_scene(scene: str | Path) -> Scene:
         if str(scene) not in names:
             near = difflib.get_close_matches(str(scene), names, n=1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise SceneError(f"no scene {str(scene)!r}{hint}; give a .yaml file or one of: {', '.join(names)}")
-        with importlib.resources.as_file(importlib.resources.files("gdpro_sim.scenes") / f"{scene}.yaml") as shipped:
+            raise SceneError(
+                f"no scene {str(scene)!r}{hint}; give a .yaml file or one of: {', '.join(names)}"
+            )
+        with importlib.resources.as_file(
+            importlib.resources.files("gdpro_sim.scenes") / f"{scene}.yaml"
+        ) as shipped:
             return _parse(shipped.read_text(encoding="utf-8"), f"{scene}.yaml", Path.cwd())
     try:
         text = path.read_text(encoding="utf-8")
@@ -191,7 +213,9 @@ def _parse(text: str, source: str, folder: Path) -> Scene:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "unknown place"
-        raise SceneError(f"{source}: not valid YAML at {where}: {getattr(error, 'problem', None) or error}") from None
+        raise SceneError(
+            f"{source}: not valid YAML at {where}: {getattr(error, 'problem', None) or error}"
+        ) from None
     if not isinstance(data, dict):
         raise SceneError(f"{source}: a scene is a mapping with at least `bodies:`, got {type(data).__name__}")
     if "folder" in data:
@@ -233,7 +257,8 @@ def _explain(item: Any, source: str) -> str:
     message = str(item["msg"])
     message = message.removeprefix("Value error, ").replace("Input should be", "must be")
     message = message[0].lower() + message[1:]
-    shown = "" if "got" in message or isinstance(value, dict | list) or repr(value) in message else f", got {value!r}"
+    said = "got" in message or (isinstance(value, str) and repr(value) in message)
+    shown = "" if said or isinstance(value, dict | list) else f", got {value!r}"
     return f"{source}: {place or 'scene'}: {message}{shown}"
 
 

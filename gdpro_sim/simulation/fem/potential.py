@@ -20,6 +20,8 @@ RANGES = 128
 CONTACT_PER_ELASTIC = 10.0
 """Ground stiffness of a vertex as a multiple of its own elastic stiffness."""
 
+STICK_PER_NORMAL = 0.1
+
 CONTACT_SAG = 1e-3
 """Penetration, as a fraction of the body's size, at which one vertex would carry the whole body's weight."""
 
@@ -70,6 +72,7 @@ class IncrementalPotential:
         self.vertices.damping = _reals(rest.mass_damping, device)
         self.vertices.friction = _reals(model.friction, device)
         self.vertices.contact_stiffness = _reals(stiffness, device)
+        self.vertices.stick_stiffness = _reals(STICK_PER_NORMAL * stiffness, device)
         self.vertices.contact_ramp = _reals(ramp, device)
         self.vertices.fixed = wp.array(self.fixed.astype(np.int32), dtype=wp.int32, device=device)
         self.vertices.offsets = wp.array(topology.corner_offsets, dtype=wp.int32, device=device)

@@ -1,0 +1,47 @@
+"""What a file holds, as plain data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gdpro_sim.asset import Asset, kind
+from gdpro_sim.io.usd import SimulationReader
+
+
+def describe(file: str | Path) -> dict[str, Any]:
+    """Facts about an asset, a simulation or a mesh file. Raises AssetError or MeshError where it is none of them."""
+    path = Path(file)
+    what = kind(path)
+    if what == "asset":
+        return {"kind": "asset", **Asset.load(path).summary()}
+    if what == "simulation":
+        reader = SimulationReader(path)
+        return {
+            "kind": "simulation",
+            "frames": len(reader),
+            "fps": reader.fps,
+            "duration_s": reader.times[-1] - reader.times[0],
+            "bodies": {
+                body.name: {"gaussians": len(body.gaussians), "vertices": len(body.gaussians.vertices)}
+                for body in reader.bodies
+            },
+            "precision": reader.precision,
+            "bytes": path.stat().st_size,
+        }
+    from gdpro_sim.meshing import load_mesh
+
+    mesh = load_mesh(path)
+    return {
+        "kind": "mesh",
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        "size_m": np.ptp(mesh.vertices, axis=0).round(6).tolist(),
+        "sha256": mesh.sha256,
+        "messages": list(mesh.messages),
+    }
+
+
+__all__ = ["describe"]

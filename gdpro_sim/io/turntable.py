@@ -1,0 +1,106 @@
+"""Pictures of files: an asset on a turntable, or every frame of a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gdpro_sim.asset import Asset, kind
+from gdpro_sim.cameras import Cameras
+from gdpro_sim.device import resolve_device
+from gdpro_sim.errors import RequestError
+from gdpro_sim.files import prepare_folder
+from gdpro_sim.io.images import write_png
+from gdpro_sim.io.preview import Renderer, Studio, frame_camera
+from gdpro_sim.io.usd import SimulationReader
+from gdpro_sim.simulation.frame import Frame
+
+
+def render_file(
+    file: str | Path,
+    output: str | Path,
+    *,
+    views: int = 24,
+    camera: dict[str, Any] | None = None,
+    shading: str = "studio",
+    background: str = "studio",
+    device: str = "auto",
+    on_progress: Callable[[str, int, int], None] | None = None,
+) -> list[Path]:
+    """Write `frame_00000.png` … into the folder `output` and return the paths.
+
+    An asset is drawn from `views` sides, a simulation once per frame. camera: azimuth, elevation, fov in degrees,
+    width and height in pixels. Raises RequestError or AssetError for a file that is neither.
+    """
+    path, folder = Path(file), Path(output)
+    view = {"azimuth": -60.0, "elevation": 14.0, "fov": 32.0, "width": 960, "height": 720, **(camera or {})}
+    name = resolve_device(device)
+    what = kind(path)
+    if what not in ("asset", "simulation"):
+        raise RequestError(
+            f"{path} is neither an asset nor a simulation; turn a mesh into an asset first: "
+            f"gdpro import {path} -o {path.stem}.usdc"
+        )
+    report = on_progress or (lambda phase, done, total: None)
+    prepare_folder(folder, "frame_00000.png")
+    written: list[Path] = []
+
+    def write(picture: np.ndarray, total: int) -> None:
+        written.append(folder / f"frame_{len(written):05d}.png")
+        write_png(written[-1], picture)
+        report("render", len(written), total)
+
+    if what == "asset":
+        bound = Asset.load(path).gaussians.to(name)
+        gaussians, normals = bound.gaussians(), bound.normals()
+        low, high = bound.vertices.amin(0).cpu().numpy(), bound.vertices.amax(0).cpu().numpy()
+        renderer = Renderer(
+            _turntable(low, high, views, view), _studio(low, high, float(low[2]), shading, background)
+        )
+        for index in range(views):
+            write(renderer.render(gaussians, normals, index), views)
+        return written
+    reader = SimulationReader(path)
+    boxes = np.array([_bounds(reader.frame(i)) for i in sorted({0, len(reader) // 2, len(reader) - 1})])
+    low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
+    ground = reader.metadata.get("scene", {}).get("ground")
+    renderer = Renderer(
+        frame_camera(low, high, **view),
+        _studio(boxes[0, 0], boxes[0, 1], ground["height"] if ground else None, shading, background),
+    )
+    bodies = [body.gaussians.to(name) for body in reader.bodies]
+    for frame in reader:
+        normals = torch.cat(
+            [b.normals(torch.from_numpy(f.vertices)) for b, f in zip(bodies, frame.bodies, strict=True)]
+        )
+        write(renderer.render(frame.gaussians().to(name), normals), len(reader))
+    return written
+
+
+def _turntable(low: np.ndarray, high: np.ndarray, views: int, view: dict[str, Any]) -> Cameras:
+    turns = [
+        frame_camera(low, high, **{**view, "azimuth": view["azimuth"] + 360.0 * i / views})
+        for i in range(views)
+    ]
+    return Cameras(
+        torch.cat([t.viewmats for t in turns]),
+        torch.cat([t.Ks for t in turns]),
+        turns[0].width,
+        turns[0].height,
+    )
+
+
+def _studio(low: np.ndarray, high: np.ndarray, ground: float | None, shading: str, background: str) -> Studio:
+    return Studio(shading, background, ground, float((high - low).max()))
+
+
+def _bounds(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    points = np.concatenate([body.vertices for body in frame.bodies])
+    return points.min(axis=0), points.max(axis=0)
+
+
+__all__ = ["render_file"]

@@ -1,0 +1,154 @@
+"""The command line as a user meets it: exit codes, one clear line per error, JSON, killed and resumed runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+SCENE = """
+bodies:
+  - asset: ball.obj
+    size: 0.2
+    position: [0, 0, 0.05]
+    budget: 1500
+    tets: 150
+    material: {{preset: jelly, young: 5.0e4}}
+fps: 30
+duration: {duration}
+camera: {{width: 96, height: 64}}
+"""
+
+
+def gdpro(*arguments: str | Path, cwd: Path, ok: bool = True) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "gdpro_sim.cli", *map(str, arguments)]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+    if ok:
+        assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a mesh, a scene of it, an asset and a finished simulation."""
+    path = tmp_path_factory.mktemp("cli")
+    trimesh.creation.icosphere(subdivisions=2, radius=0.5).export(path / "ball.obj")
+    (path / "scene.yaml").write_text(SCENE.format(duration=0.3))
+    gdpro("import", "ball.obj", "-o", "ball.usdc", "--budget", "1500", "--tets", "150", "--color", "teal", cwd=path)
+    done = gdpro("simulate", "scene.yaml", "-o", "run", "--json", cwd=path)
+    (path / "run.json").write_text(done.stdout)
+    return path
+
+
+def test_simulate_writes_everything(folder: Path) -> None:
+    recording = json.loads((folder / "run.json").read_text())
+    assert recording["frame_count"] == 10
+    for name in ("asset.usdc", "simulation.usdc", "preview.mp4", "contact_sheet.png", "metrics.csv"):
+        assert (folder / "run" / name).stat().st_size > 0, name
+    assert len(list((folder / "run/frames").glob("*.png"))) == 10
+    assert not list((folder / "run").glob(".*")), "nothing temporary is left behind"
+    rows = list(csv.DictReader((folder / "run/metrics.csv").open()))
+    assert len(rows) == 10
+    heights = [float(row["gravity_energy_J"]) for row in rows]
+    assert heights[0] > heights[3]
+    for column in ("time_s", "kinetic_energy_J", "momentum_z_kg_m_per_s", "contacts", "cg_iterations", "ms_solve"):
+        assert all(np.isfinite(float(row[column])) for row in rows), column
+    assert any(int(row["contacts"]) > 0 for row in rows)
+
+
+def test_info_render_and_scenes(folder: Path) -> None:
+    asset = json.loads(gdpro("info", "ball.usdc", "--json", cwd=folder).stdout)
+    assert asset["kind"] == "asset" and asset["tets"] > 50
+    simulation = json.loads(gdpro("info", "run/simulation.usdc", "--json", cwd=folder).stdout)
+    assert simulation["kind"] == "simulation" and simulation["frames"] == 10
+    mesh = json.loads(gdpro("info", "ball.obj", "--json", cwd=folder).stdout)
+    assert mesh["kind"] == "mesh" and mesh["faces"] == 320
+    size = ("--width", "64", "--height", "48")
+    gdpro("render", "ball.usdc", "-o", "turn", "--frames", "3", *size, cwd=folder)
+    assert len(list((folder / "turn").glob("frame_*.png"))) == 3
+    gdpro("render", "run/simulation.usdc", "-o", "again", "--shading", "none", *size, cwd=folder)
+    assert len(list((folder / "again").glob("frame_*.png"))) == 10
+    assert "jelly_bunny" in json.loads(gdpro("scenes", "--json", cwd=folder).stdout)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["simulat"], "Did you mean 'simulate'"),
+        (["simulate"], "Missing argument"),
+        (["simulate", "scene.yaml"], "Missing option"),
+        (["simulate", "nosuch", "-o", "x"], "give a .yaml file or one of"),
+        (["simulate", "missing.yaml", "-o", "x"], "no such file"),
+        (["simulate", "scene.yaml", "-o", "ball.obj"], "give a folder"),
+        (["simulate", "scene.yaml", "-o", "/proc/nowhere"], "cannot be made"),
+        (["simulate", "scene.yaml", "-o", "x", "--device", "cuda:9"], "not available on this machine"),
+        (["simulate", "scene.yaml", "-o", "x", "--seed", "-1"], "--seed"),
+        (["import", "missing.obj", "-o", "x.usdc"], "missing.obj"),
+        (["import", "scene.yaml", "-o", "x.usdc"], "scene.yaml"),
+        (["import", "ball.obj", "-o", "x.txt"], "must end in .usdc"),
+        (["import", "ball.obj", "-o", "nowhere/x.usdc"], "does not exist"),
+        (["import", "ball.obj", "-o", "x.usdc", "--color", "nocolour"], "nocolour"),
+        (["import", "ball.obj", "-o", "x.usdc", "--material", "jely"], "did you mean 'jelly'"),
+        (["import", "ball.obj", "-o", "x.usdc", "--scale", "-1"], "scale"),
+        (["import", "ball.obj", "-o", "x.usdc", "--up", "w"], "auto, y, z"),
+        (["import", "ball.usdc", "-o", "x.usdc"], "ball.usdc"),
+        (["render", "ball.obj", "-o", "x"], "gdpro import"),
+        (["render", "ball.usdc", "-o", "x", "--shading", "pretty"], "studio, none"),
+        (["info", "missing.usdc"], "missing.usdc"),
+        (["info", "scene.yaml"], "scene.yaml"),
+    ],
+)
+def test_wrong_requests_exit_2_with_one_line(folder: Path, arguments: list[str], expected: str) -> None:
+    done = gdpro(*arguments, cwd=folder, ok=False)
+    assert done.returncode == 2, done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("gdpro: "), done.stderr
+    assert expected in done.stderr
+    assert not (folder / "x.usdc").exists()
+
+
+def test_debug_shows_the_traceback(folder: Path) -> None:
+    done = gdpro("info", "missing.usdc", "--debug", cwd=folder, ok=False)
+    assert done.returncode == 2 and "Traceback" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_run_continues_to_the_same_frames(folder: Path, how: signal.Signals, tmp_path: Path) -> None:
+    (folder / "long.yaml").write_text(SCENE.format(duration=1.5))
+    output = tmp_path / "stopped"
+    command = [sys.executable, "-m", "gdpro_sim.cli", "simulate", "long.yaml", "-o", str(output), "--quiet"]
+    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while len(list((output / "frames").glob("frame_*.png"))) < 8 and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.kill(process.pid, how)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    if how == signal.SIGINT:
+        assert errors.strip() == "gdpro: interrupted; finished frames are kept, the same command continues"
+    kept = len(list((output / ".resume").glob("frame_*.npz")))
+    assert kept >= 7
+    assert not (output / "preview.mp4").exists()
+
+    done = gdpro("simulate", "long.yaml", "-o", output, "--json", cwd=folder)
+    assert json.loads(done.stdout)["resumed_frames"] == kept
+    assert not list(output.glob(".*"))
+    straight = tmp_path / "straight"
+    straight.mkdir()
+    # Tets are not repeatable: the undisturbed run starts from the stopped run's asset.
+    scene = SCENE.format(duration=1.5).replace("ball.obj", str(output / "asset.usdc")).replace("    budget: 1500\n", "")
+    (straight / "scene.yaml").write_text(scene.replace("  - asset", "  - name: ball\n    asset"))
+    gdpro("simulate", straight / "scene.yaml", "-o", straight / "out", cwd=straight)
+    for name in sorted(p.name for p in (output / "frames").iterdir()):
+        assert (output / "frames" / name).read_bytes() == (straight / "out/frames" / name).read_bytes(), name
