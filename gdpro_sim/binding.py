@@ -66,7 +66,7 @@ class BoundGaussians:
     def gaussians(self, vertices: torch.Tensor | None = None, *, rotate_sh: bool = True) -> Gaussians:
         """Gaussians carried by `vertices` [V, 3] float32 m (default: the rest vertices).
 
-        The rest vertices give the rest Gaussians back bit for bit; a rigid motion moves every Gaussian rigidly.
+        The rest vertices give the rest Gaussians back bit for bit; a rigid motion moves them rigidly.
         With `rotate_sh` False the colours keep their rest directions (cheaper, and exact at degree 0).
         Raises AssetError for a wrong shape or dtype. Not differentiable.
         """

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn  # fmt: skip
+from rich.progress import (  # fmt: skip
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from typer.exceptions import TyperException
 
@@ -275,7 +283,8 @@ def _show(data: dict[str, Any], title: str, as_json: bool, quiet: bool) -> None:
     if as_json:
         print(json.dumps(data))
     elif not quiet:
-        _table(title, [(key.replace("_", " "), value if isinstance(value, str) else json.dumps(value)) for key, value in data.items()])  # fmt: skip
+        rows = ((k.replace("_", " "), v if isinstance(v, str) else json.dumps(v)) for k, v in data.items())
+        _table(title, list(rows))
 
 
 def _check_choice(option: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -23,7 +23,7 @@ wp.config.log_level = wp.LOG_WARNING
 
 
 def _start_warp() -> None:
-    """Initialise Warp without its native notice that a machine has no CUDA driver (many of our users' have none)."""
+    """Initialise Warp without its native notice that a machine has no CUDA driver ."""
     try:
         saved = os.dup(2)
     except OSError:  # no standard error to keep clean
@@ -68,7 +68,7 @@ def resolve_device(device: str = "auto") -> str:
 
 
 def thread_count() -> int:
-    """Number of CPU threads used for one launch (`GDPRO_THREADS`, default: the cores this process may use)."""
+    """CPU threads used for one launch: `GDPRO_THREADS`, else the cores this process may use."""
     global _threads
     if _threads is None:
         text = os.environ.get("GDPRO_THREADS", "")
@@ -126,7 +126,7 @@ def launch_chunked(
     device: str,
     minimum: int = 1024,
 ) -> None:
-    """Launch `kernel(start, *inputs, *outputs)` over `count` indices: one launch on CUDA, one per core on the CPU."""
+    """Launch `kernel(start, *inputs, *outputs)` over `count` indices: once on CUDA, per core on the CPU."""
     if count <= 0:
         return
     if device != "cpu":

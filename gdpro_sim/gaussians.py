@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 
@@ -34,7 +34,12 @@ class Gaussians:
             got = tuple(getattr(self, name).shape)
             if got != shape:
                 raise ValueError(f"Gaussians.{name} must have shape {shape}, got {got}")
-        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in (1, 4, 9, 16) or self.sh.shape[2] != 3:
+        if (
+            self.sh.ndim != 3
+            or self.sh.shape[0] != n
+            or self.sh.shape[1] not in (1, 4, 9, 16)
+            or self.sh.shape[2] != 3
+        ):
             raise ValueError(f"Gaussians.sh must have shape ({n}, 1|4|9|16, 3), got {tuple(self.sh.shape)}")
 
     def __len__(self) -> int:
@@ -43,6 +48,10 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    def to(self, device: str | torch.device) -> Gaussians:
+        """The same Gaussians with every tensor on `device`."""
+        return Gaussians(*(getattr(self, f.name).to(device) for f in fields(self)))
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:

@@ -13,26 +13,74 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 PRESETS: dict[str, dict[str, float]] = {
-    # Gelatin dessert: E 1-30 kPa over concentration (Markidou et al. 2005, Med. Eng. Phys. 27); water density.
-    "jelly": {"young": 2.0e4, "poisson": 0.45, "density": 1050.0, "friction": 0.5, "rayleigh_stiffness": 2.0e-3},
+    # Gelatin dessert: E 1-30 kPa over concentration (Markidou et al. 2005, Med. Eng. Phys. 27).
+    "jelly": {
+        "young": 2.0e4,
+        "poisson": 0.45,
+        "density": 1050.0,
+        "friction": 0.5,
+        "rayleigh_stiffness": 2.0e-3,
+    },
     # Soft natural rubber, Shore A about 30 (Gent's relation gives E about 1 MPa).
-    "rubber": {"young": 1.0e6, "poisson": 0.47, "density": 1100.0, "friction": 0.8, "rayleigh_stiffness": 5.0e-4},
+    "rubber": {
+        "young": 1.0e6,
+        "poisson": 0.47,
+        "density": 1100.0,
+        "friction": 0.8,
+        "rayleigh_stiffness": 5.0e-4,
+    },
     # Platinum silicone, Shore 00-30 (Ecoflex 00-30 data sheet: 100 % modulus 69 kPa).
-    "silicone": {"young": 1.0e5, "poisson": 0.47, "density": 1070.0, "friction": 0.7, "rayleigh_stiffness": 1.0e-3},
+    "silicone": {
+        "young": 1.0e5,
+        "poisson": 0.47,
+        "density": 1070.0,
+        "friction": 0.7,
+        "rayleigh_stiffness": 1.0e-3,
+    },
     # Flexible polyurethane foam (Ashby & Gibson, Cellular Solids, 2nd ed., table 5.1).
     "foam": {"young": 5.0e4, "poisson": 0.30, "density": 60.0, "friction": 0.6, "rayleigh_stiffness": 4.0e-3},
     # Passive skeletal muscle, small strain (Collinsworth et al. 2002, Am. J. Physiol. Cell 283).
-    "muscle": {"young": 3.0e4, "poisson": 0.47, "density": 1060.0, "friction": 0.5, "rayleigh_stiffness": 2.0e-3},
+    "muscle": {
+        "young": 3.0e4,
+        "poisson": 0.47,
+        "density": 1060.0,
+        "friction": 0.5,
+        "rayleigh_stiffness": 2.0e-3,
+    },
     # Pine along the grain, taken as isotropic (Wood Handbook, USDA FPL-GTR-282, table 5-3).
-    "wood": {"young": 1.0e10, "poisson": 0.35, "density": 500.0, "friction": 0.4, "rayleigh_stiffness": 1.0e-5},
+    "wood": {
+        "young": 1.0e10,
+        "poisson": 0.35,
+        "density": 500.0,
+        "friction": 0.4,
+        "rayleigh_stiffness": 1.0e-5,
+    },
     # Stoneware ceramic (Callister, Materials Science and Engineering, appendix B).
-    "ceramic": {"young": 7.0e10, "poisson": 0.22, "density": 2400.0, "friction": 0.4, "rayleigh_stiffness": 1.0e-5},
+    "ceramic": {
+        "young": 7.0e10,
+        "poisson": 0.22,
+        "density": 2400.0,
+        "friction": 0.4,
+        "rayleigh_stiffness": 1.0e-5,
+    },
     # Aluminium 6061 (Callister, appendix B).
-    "aluminium": {"young": 6.9e10, "poisson": 0.33, "density": 2700.0, "friction": 0.35, "rayleigh_stiffness": 1.0e-5},
+    "aluminium": {
+        "young": 6.9e10,
+        "poisson": 0.33,
+        "density": 2700.0,
+        "friction": 0.35,
+        "rayleigh_stiffness": 1.0e-5,
+    },
     # Structural steel (EN 1993-1-1, 3.2.6).
-    "steel": {"young": 2.1e11, "poisson": 0.30, "density": 7850.0, "friction": 0.35, "rayleigh_stiffness": 1.0e-5},
+    "steel": {
+        "young": 2.1e11,
+        "poisson": 0.30,
+        "density": 7850.0,
+        "friction": 0.35,
+        "rayleigh_stiffness": 1.0e-5,
+    },
 }
-"""Named presets. Sources stand beside each; friction is against a dry floor and damping chosen for a plausible ring."""
+"""Named presets. Sources stand beside each; friction is against a dry floor, damping is chosen."""
 
 
 class Material(BaseModel):

@@ -57,7 +57,8 @@ class Vertices:
     mass: wp.array[wp.float64]  # kg
     damping: wp.array[wp.float64]  # Rayleigh mass damping, 1/s
     friction: wp.array[wp.float64]
-    contact_stiffness: wp.array[wp.float64]  # N/m
+    contact_stiffness: wp.array[wp.float64]  # N/m, along the normal
+    stick_stiffness: wp.array[wp.float64]  # N/m, in the tangent plane
     contact_ramp: wp.array[wp.float64]  # m
     fixed: wp.array[wp.int32]
     offsets: wp.array[wp.int32]  # into `corners`
@@ -296,7 +297,8 @@ def vertex_energy(
     if depth > wp.float64(0.0) or limit[i] > wp.float64(0.0):
         stiffness = vertices.contact_stiffness[i]
         energy += normal_energy(depth, stiffness, vertices.contact_ramp[i])
-        energy += friction_energy(tangential_slip(position, anchor[i]), stiffness, limit[i])
+        slip = tangential_slip(position, anchor[i])
+        energy += friction_energy(slip, vertices.stick_stiffness[i], limit[i])
     energy_out[first + i] = energy
 
 
@@ -321,7 +323,8 @@ def contact_energy(
         ramp = vertices.contact_ramp[i]
         limit = vertices.friction[i] * normal_force(depth, stiffness, ramp)
         energy = normal_energy(depth, stiffness, ramp)
-        energy += friction_energy(tangential_slip(position, anchor[i]), stiffness, limit)
+        slip = tangential_slip(position, anchor[i])
+        energy += friction_energy(slip, vertices.stick_stiffness[i], limit)
     energy_out[i] = energy
 
 
@@ -367,9 +370,10 @@ def assemble_vertices(
     if depth > wp.float64(0.0) or limit[i] > wp.float64(0.0):
         stiffness = vertices.contact_stiffness[i]
         ramp = vertices.contact_ramp[i]
+        stick = vertices.stick_stiffness[i]
         slip = tangential_slip(position, anchor[i])
-        tangential = friction_gradient(slip, stiffness, limit[i])
-        curvature = friction_hessian(slip, stiffness, limit[i])
+        tangential = friction_gradient(slip, stick, limit[i])
+        curvature = friction_hessian(slip, stick, limit[i])
         gradient += wp.vec3d(tangential[0], tangential[1], -normal_force(depth, stiffness, ramp))
         zero = wp.float64(0.0)
         # fmt: off
@@ -473,4 +477,5 @@ def finish(
     force = normal_force(penetration(ground, position), stiffness, vertices.contact_ramp[i])
     limit = vertices.friction[i] * force
     slip = tangential_slip(position, anchor_out[i])
-    anchor_out[i] = friction_anchor(wp.vec2d(position[0], position[1]), slip, stiffness, limit)
+    stick = vertices.stick_stiffness[i]
+    anchor_out[i] = friction_anchor(wp.vec2d(position[0], position[1]), slip, stick, limit)

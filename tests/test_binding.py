@@ -1,4 +1,4 @@
-"""Bound Gaussians follow their mesh: rest, rigid motion, affine maps, spherical harmonics, degenerate triangles."""
+"""Bound Gaussians follow their mesh: rest, rigid motion, affine maps, harmonics, degenerate triangles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: exit codes, one clear line per error, JSON, killed and resumed runs."""
+"""The command line as a user meets it: exit codes, one line per error, JSON, stopped and resumed runs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("cli")
     trimesh.creation.icosphere(subdivisions=2, radius=0.5).export(path / "ball.obj")
     (path / "scene.yaml").write_text(SCENE.format(duration=0.3))
-    gdpro("import", "ball.obj", "-o", "ball.usdc", "--budget", "1500", "--tets", "150", "--color", "teal", cwd=path)
+    gdpro("import", "ball.obj", "-o", "ball.usdc", "--budget", "1500", "--tets", "150", cwd=path)
     done = gdpro("simulate", "scene.yaml", "-o", "run", "--json", cwd=path)
     (path / "run.json").write_text(done.stdout)
     return path
@@ -60,7 +60,7 @@ def test_simulate_writes_everything(folder: Path) -> None:
     assert len(rows) == 10
     heights = [float(row["gravity_energy_J"]) for row in rows]
     assert heights[0] > heights[3]
-    for column in ("time_s", "kinetic_energy_J", "momentum_z_kg_m_per_s", "contacts", "cg_iterations", "ms_solve"):
+    for column in ("time_s", "kinetic_energy_J", "momentum_z_kg_m_per_s", "contacts", "ms_solve"):
         assert all(np.isfinite(float(row[column])) for row in rows), column
     assert any(int(row["contacts"]) > 0 for row in rows)
 
@@ -123,7 +123,7 @@ def test_debug_shows_the_traceback(folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_run_continues_to_the_same_frames(folder: Path, how: signal.Signals, tmp_path: Path) -> None:
+def test_a_stopped_run_continues_to_the_same_frames(folder: Path, how: int, tmp_path: Path) -> None:
     (folder / "long.yaml").write_text(SCENE.format(duration=1.5))
     output = tmp_path / "stopped"
     command = [sys.executable, "-m", "gdpro_sim.cli", "simulate", "long.yaml", "-o", str(output), "--quiet"]
@@ -147,7 +147,8 @@ def test_a_stopped_run_continues_to_the_same_frames(folder: Path, how: signal.Si
     straight = tmp_path / "straight"
     straight.mkdir()
     # Tets are not repeatable: the undisturbed run starts from the stopped run's asset.
-    scene = SCENE.format(duration=1.5).replace("ball.obj", str(output / "asset.usdc")).replace("    budget: 1500\n", "")
+    scene = SCENE.format(duration=1.5).replace("ball.obj", str(output / "asset.usdc"))
+    scene = scene.replace("    budget: 1500\n", "")
     (straight / "scene.yaml").write_text(scene.replace("  - asset", "  - name: ball\n    asset"))
     gdpro("simulate", straight / "scene.yaml", "-o", straight / "out", cwd=straight)
     for name in sorted(p.name for p in (output / "frames").iterdir()):

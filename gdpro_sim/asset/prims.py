@@ -20,6 +20,7 @@ from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.errors import AssetError, MeshError
 from gdpro_sim.gaussians import Gaussians, sh_to_rgb
 from gdpro_sim.materials import Material
+from gdpro_sim.meshing.color import srgb_to_linear
 from gdpro_sim.meshing.tetmesh import TetMesh
 
 Precision = Literal["float", "half"]
@@ -59,12 +60,9 @@ def vec4f(a: np.ndarray) -> Vt.Vec4fArray:
     return Vt.Vec4fArray.FromNumpy(np.ascontiguousarray(a, np.float32).reshape(-1, 4))
 
 
-def linear_from_srgb(rgb: np.ndarray) -> np.ndarray:
-    """Linear-light colour of sRGB values, clipped to [0, 1]; displayColor is linear by USD's convention."""
-    c = np.clip(rgb, 0.0, 1.0).astype(np.float32)
-    low = c / np.float32(12.92)
-    high = np.power((c + np.float32(0.055)) / np.float32(1.055), np.float32(2.4))
-    return np.where(c <= 0.04045, low, high).astype(np.float32)
+def _display(rgb: np.ndarray) -> Vt.Vec3fArray:
+    """displayColor of sRGB values: linear light by USD's convention, clipped to [0, 1]."""
+    return vec3f(srgb_to_linear(np.clip(rgb, 0.0, 1.0)))
 
 
 def bounds(points: np.ndarray) -> Vt.Vec3fArray:
@@ -146,7 +144,7 @@ class SplatPrims:
         points = UsdGeom.Points.Define(stage, parent.AppendChild("Points"))
         points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
         colors = points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-        colors.Set(vec3f(linear_from_srgb(to_numpy(sh_to_rgb(g.sh[:, 0])))))
+        colors.Set(_display(to_numpy(sh_to_rgb(g.sh[:, 0]))))
         primvars = UsdGeom.PrimvarsAPI(points)
         # Blender stops reading primvars at the first type it does not know (half3 is one).
         rot_type = T.QuathArray if precision == "half" else T.QuatfArray
@@ -225,7 +223,7 @@ def define_mesh(
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     interpolation = UsdGeom.Tokens.vertex if colors is not None else UsdGeom.Tokens.constant
     shown = colors if colors is not None else average_color[None]
-    mesh.CreateDisplayColorPrimvar(interpolation).Set(vec3f(linear_from_srgb(shown)))
+    mesh.CreateDisplayColorPrimvar(interpolation).Set(_display(shown))
     prim = mesh.GetPrim()
     if colors is not None:
         set_custom(prim, "gdpro:vertexColors", T.Float3Array, vec3f(colors))
@@ -399,7 +397,6 @@ __all__ = [
     "define_tets",
     "floats",
     "ints",
-    "linear_from_srgb",
     "read",
     "read_binding",
     "read_material",

@@ -10,13 +10,12 @@ from pxr import Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics
 
 from gdpro_sim.errors import AssetError, OutputError
 from gdpro_sim.files import atomic_write, remove_quietly
+from gdpro_sim.meshing.load import TRIMESH_SUFFIXES, USD_SUFFIXES
 
 FORMAT_VERSION = 1
 """Version of the `gdpro:` attributes, written as `gdpro:formatVersion`."""
 
-USD_SUFFIXES = (".usdc", ".usda", ".usdz", ".usd")
 WRITABLE_SUFFIXES = (".usdc", ".usda", ".usdz")
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf", ".off", ".dae", ".3mf")
 
 _ZIP_EPOCH = (
     631152000  # 1990-01-01: the time stored inside a .usdz, so that the same asset gives the same bytes
@@ -174,7 +173,7 @@ def kind(path: str | Path) -> FileKind:
     """
     file = check_readable(path)
     suffix = file.suffix.lower()
-    if suffix in MESH_SUFFIXES:
+    if suffix in TRIMESH_SUFFIXES:
         return "mesh"
     if suffix not in USD_SUFFIXES:
         return "unknown"

@@ -12,7 +12,7 @@ from gdpro_sim.io.usd import SimulationReader
 
 
 def describe(file: str | Path) -> dict[str, Any]:
-    """Facts about an asset, a simulation or a mesh file. Raises AssetError or MeshError where it is none of them."""
+    """Facts about an asset, a simulation or a mesh file. Raises AssetError or MeshError for any other."""
     path = Path(file)
     what = kind(path)
     if what == "asset":

@@ -26,7 +26,7 @@ def read_png(path: str | Path) -> np.ndarray:
 
 
 def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """Write uint8 [H, W, 3] pictures of even size as H.264 (yuv420p, plays everywhere). Raises OutputError."""
+    """Write uint8 [H, W, 3] pictures of even size as H.264 (yuv420p). Raises OutputError."""
     with (
         atomic_write(path) as temporary,
         imageio.get_writer(
@@ -42,7 +42,7 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float) ->
         ) as writer,
     ):
         for picture in pictures:
-            writer.append_data(picture)
+            writer.append_data(picture)  # type: ignore[attr-defined]
 
 
 def write_contact_sheet(

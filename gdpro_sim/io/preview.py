@@ -1,8 +1,8 @@
 """Preview pictures: Gaussians under studio lights, with soft shadows on a gridded floor.
 
-Each light is a camera far away: its splatted alpha and depth say how much of it reaches a point. One key light
-in a few jittered copies and a ring of sky lights give soft shadows, contact shadows and ambient occlusion to the
-Gaussians and to the floor alike. Colours are display-referred; light is applied with a 2.2 power.
+Each light is a camera far away: its splatted alpha and depth say how much of it reaches a point. One key
+light in a few jittered copies and a ring of sky lights give soft shadows, contact shadows and occlusion
+to Gaussians and floor alike. Colours are display-referred; light is applied with a 2.2 power.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _shadow_maps(gaussians: Gaussians, directions: np.ndarray) -> _ShadowMaps:
 def light(gaussians: Gaussians, normals: torch.Tensor, cameras: Cameras) -> tuple[Gaussians, _ShadowMaps]:
     """Gaussians with studio light multiplied into their colours, and the shadow maps that were made for it.
 
-    normals: [N, 3] unit. The light is baked for the first camera (its side decides where the key light stands).
+    normals: [N, 3] unit. The key light stands on the side of the first camera.
     """
     eye = cameras.positions[0].to(gaussians.means)
     middle = gaussians.means.mean(0)
@@ -297,7 +297,7 @@ def frame_camera(
     fov: float,
     width: int,
     height: int,
-    eye: Sequence[float] | None = None,
+    eye: Sequence[float] | np.ndarray | None = None,
     target: Sequence[float] | None = None,
 ) -> Cameras:
     """One camera that sees the box `low`..`high` (m); angles in degrees. `eye` and `target` override."""
@@ -319,7 +319,7 @@ def frame_camera(
         needed = np.maximum(np.abs(offset @ right) / tan_h, np.abs(offset @ upward) / tan_v) + depth
         distance = max(1.12 * float(needed.max()), 1e-3)
         eye = centre + distance * direction
-    return Cameras.look_at([eye], centre, vertical_fov=vertical, width=width, height=height)
+    return Cameras.look_at(np.asarray(eye, float), centre, vertical_fov=vertical, width=width, height=height)
 
 
 __all__ = ["Renderer", "Studio", "frame_camera", "light"]

@@ -1,7 +1,7 @@
 """Run a scene and write everything: asset, time-sampled USD, pictures, video, contact sheet, metrics.
 
-Every finished frame is kept in `.resume/` (solver state, surfaces, figures) until the run is complete, so a run
-that was stopped or killed continues where it was, to the same bytes.
+Every finished frame is kept in `.resume/` (solver state, surfaces, figures) until the run is complete, so a
+run that was stopped or killed continues where it was, to the same bytes.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class Recording:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for `--json`."""
-        return {k: ([str(p) for p in v] if k == "assets" else str(v) if isinstance(v, Path) else v) for k, v in asdict(self).items()}  # fmt: skip
+        data = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
+        return {**data, "assets": [str(path) for path in self.assets]}
 
 
 def record(
@@ -75,8 +76,8 @@ def record(
     """Simulate `scene` and write its results into the folder `output`.
 
     A run of the same scene that was interrupted there is continued, unless `fresh`. Raises RequestError (also
-    SceneError, MeshError, AssetError, DeviceError) before anything runs, SolverError or OutputError later; finished
-    frames stay on disk and the next call continues after them.
+    SceneError, MeshError, AssetError, DeviceError) before anything runs, SolverError or OutputError later;
+    finished frames stay on disk and the next call continues after them.
     """
     checked = scene if isinstance(scene, Scene) else load_scene(scene)
     folder = prepare_folder(output, "simulation.usdc")

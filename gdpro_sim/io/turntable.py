@@ -33,8 +33,8 @@ def render_file(
 ) -> list[Path]:
     """Write `frame_00000.png` … into the folder `output` and return the paths.
 
-    An asset is drawn from `views` sides, a simulation once per frame. camera: azimuth, elevation, fov in degrees,
-    width and height in pixels. Raises RequestError or AssetError for a file that is neither.
+    An asset is drawn from `views` sides, a simulation once per frame. camera: azimuth, elevation, fov in
+    degrees, width and height in pixels. Raises RequestError or AssetError for a file that is neither.
     """
     path, folder = Path(file), Path(output)
     view = {"azimuth": -60.0, "elevation": 14.0, "fov": 32.0, "width": 960, "height": 720, **(camera or {})}

@@ -46,8 +46,8 @@ def load_assets(
             ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
             if ignored:
                 raise SceneError(
-                    f"{scene.name}: bodies[{body.name}].{ignored[0]}: applies to a mesh, but {path.name} is an "
-                    f"asset with colours of its own; remove the key"
+                    f"{scene.name}: bodies[{body.name}].{ignored[0]}: applies to a mesh, but {path.name} is "
+                    f"an asset with colours of its own; remove the key"
                 )
             asset = Asset.load(path)
         else:

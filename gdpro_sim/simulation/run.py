@@ -74,7 +74,7 @@ def simulate(
     """Load and compile a scene; iterate the result to run it.
 
     scene: a `Scene`, a YAML path, or the name of a shipped scene.
-    Raises SceneError, MeshError, AssetError or DeviceError for a wrong request; iterating may raise SolverError.
+    Raises SceneError, MeshError, AssetError or DeviceError; iterating may raise SolverError.
 
         for frame in gdpro_sim.simulate("jelly_bunny"):
             print(frame.time, frame.bodies[0].gaussians.means.mean(0))

@@ -285,12 +285,12 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 __all__ = [
-    "SceneBody",
     "Camera",
     "GroundPlane",
     "Pins",
     "Render",
     "Scene",
+    "SceneBody",
     "SolverOptions",
     "check_scene",
     "load_scene",

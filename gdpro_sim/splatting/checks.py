@@ -13,7 +13,9 @@ INDEX_LIMIT = 2**31 - 1
 """Largest count a 32-bit index can address."""
 
 
-def check_tensor(name: str, value: object, shape: Sequence[int | str], like: torch.Tensor | None = None) -> torch.Tensor:
+def check_tensor(
+    name: str, value: object, shape: Sequence[int | str], like: torch.Tensor | None = None
+) -> torch.Tensor:
     """Return `value` as a contiguous float32 tensor of `shape`; strings in `shape` stand for any size.
 
     Raises ValueError where it is not one, lies on another device than `like`, or requires grad.
@@ -22,7 +24,9 @@ def check_tensor(name: str, value: object, shape: Sequence[int | str], like: tor
     if not isinstance(value, torch.Tensor):
         raise ValueError(f"{name} must be a float32 torch tensor {wanted}, got {type(value).__name__}")
     got = tuple(value.shape)
-    fits = len(got) == len(shape) and all(isinstance(s, str) or s == g for s, g in zip(shape, got, strict=True))
+    fits = len(got) == len(shape) and all(
+        isinstance(s, str) or s == g for s, g in zip(shape, got, strict=True)
+    )
     if not fits:
         raise ValueError(f"{name} must have shape {wanted}, got {list(got)}")
     if value.dtype != torch.float32:
@@ -30,7 +34,9 @@ def check_tensor(name: str, value: object, shape: Sequence[int | str], like: tor
     if like is not None and value.device != like.device:
         raise ValueError(f"{name} must be on the device of means, {like.device}, got {value.device}")
     if value.requires_grad:
-        raise ValueError(f"{name} requires grad, but rasterization has no gradients yet; pass {name}.detach()")
+        raise ValueError(
+            f"{name} requires grad, but rasterization has no gradients yet; pass {name}.detach()"
+        )
     return value.contiguous()
 
 

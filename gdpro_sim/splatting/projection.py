@@ -129,7 +129,9 @@ def project(
     return Projection(records, radii, rects, order, cameras, count)
 
 
-def shade_harmonics(projection: Projection, means: torch.Tensor, sh: torch.Tensor, degree: int, view: View) -> None:
+def shade_harmonics(
+    projection: Projection, means: torch.Tensor, sh: torch.Tensor, degree: int, view: View
+) -> None:
     """Set channels 0-2 from spherical harmonics [N, K, 3] and channel 3 to depth; cull where not finite."""
     launch_chunked(
         kernels.shade_harmonics,
@@ -177,4 +179,13 @@ def _culled(projection: Projection) -> list[wp.array]:
     ]
 
 
-__all__ = ["Projection", "View", "array", "device_name", "pack_channels", "project", "shade_features", "shade_harmonics"]
+__all__ = [
+    "Projection",
+    "View",
+    "array",
+    "device_name",
+    "pack_channels",
+    "project",
+    "shade_features",
+    "shade_harmonics",
+]

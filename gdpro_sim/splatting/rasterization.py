@@ -41,7 +41,9 @@ class RasterOptions:
         check_choice("RasterOptions.method", self.method, METHODS)
         entries = self.max_tile_entries
         if isinstance(entries, bool) or not isinstance(entries, int) or not 0 <= entries <= INDEX_LIMIT:
-            raise ValueError(f"RasterOptions.max_tile_entries must be a whole number from 0 to {INDEX_LIMIT}, got {entries!r}")
+            raise ValueError(
+                f"RasterOptions.max_tile_entries must be a whole number from 0 to {INDEX_LIMIT}, got {entries!r}"
+            )
 
 
 def rasterization(
@@ -130,7 +132,9 @@ def rasterization(
     channels = features + with_depth
     background = means.new_zeros((cameras, channels))
     if backgrounds is not None:
-        background[:, :features] = check_tensor("backgrounds", backgrounds, (cameras, colors.shape[-1]), means)[:, :features]
+        background[:, :features] = check_tensor(
+            "backgrounds", backgrounds, (cameras, colors.shape[-1]), means
+        )[:, :features]
     divided = channels - 1 if render_mode.endswith("ED") else -1
 
     columns, rows = view.tiles
@@ -140,7 +144,9 @@ def rasterization(
 
     tile = options.method == "tile" or (options.method == "auto" and means.device.type == "cpu")
     if tile and means.device.type != "cpu":
-        raise ValueError(f'RasterOptions.method "tile" runs on the CPU only; the tensors are on {means.device}')
+        raise ValueError(
+            f'RasterOptions.method "tile" runs on the CPU only; the tensors are on {means.device}'
+        )
 
     if cameras == 0 or count == 0:
         projection = _nothing(cameras, count, means)
@@ -180,7 +186,9 @@ def rasterization(
     return result.image, result.alphas, meta
 
 
-def _check_colors(colors: object, sh_degree: int | None, cameras: int, count: int, means: torch.Tensor) -> torch.Tensor:
+def _check_colors(
+    colors: object, sh_degree: int | None, cameras: int, count: int, means: torch.Tensor
+) -> torch.Tensor:
     if sh_degree is None:
         if isinstance(colors, torch.Tensor) and colors.ndim == 3:
             colors = check_tensor("colors", colors, (cameras, count, "D"), means)
