@@ -1,0 +1,153 @@
+"""From a mesh file to an asset: read, bind Gaussians, tetrahedralize, embed, and say how it was made."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from gdpro_sim.asset.asset import Asset
+from gdpro_sim.asset.from_mesh import bind_mesh, vertex_colors
+from gdpro_sim.asset.prims import to_numpy
+from gdpro_sim.asset.stage import kind
+from gdpro_sim.errors import AssetError, MeshError
+from gdpro_sim.materials import Material
+from gdpro_sim.meshing.embedding import embed_surface
+from gdpro_sim.meshing.load import USD_SUFFIXES, load_mesh
+from gdpro_sim.meshing.tetrahedralize import tetrahedralize
+
+log = logging.getLogger(__name__)
+
+Phase = Callable[[str], None]
+
+_PACKAGES = ("gdpro-sim", "warp-lang", "trimesh", "pytetwild", "numpy")
+
+
+def import_mesh(
+    path: str | Path,
+    *,
+    name: str | None = None,
+    budget: int = 50_000,
+    color: str | None = None,
+    texture: str | Path | None = None,
+    up: str = "auto",
+    scale: float | None = None,
+    material: Material | None = None,
+    tets: bool = True,
+    target_tets: int = 6_000,
+    edge_length: float | None = None,
+    tet_method: str = "auto",
+    seed: int = 0,
+    on_progress: Phase | None = None,
+) -> Asset:
+    """Make an asset of a mesh file.
+
+    name:        default: the file's name without its suffix
+    budget:      about how many Gaussians
+    color, texture, up, scale: as in `gdpro_sim.meshing.load.load_mesh`
+    material:    stored in the asset; a scene may override it
+    tets:        False leaves them out: enough to show the asset; simulation adds them when it needs them
+    target_tets, edge_length (m), tet_method: as in `gdpro_sim.meshing.tetrahedralize.tetrahedralize`
+    seed:        of every random draw; Gaussians repeat to the bit, fTetWild's tets do not
+    on_progress: called with the name of each phase as it begins
+
+    >>> import_mesh("bunny.obj", budget=20_000).save("bunny.usdc")  # doctest: +SKIP
+
+    Raises MeshError for a mesh that cannot be read, bound or filled with tets, and AssetError where `path`
+    already is one of our own files.
+    """
+    path = Path(path)
+    tell: Phase = on_progress or (lambda phase: None)
+    if path.suffix.lower() in USD_SUFFIXES and path.is_file():
+        found = kind(path)
+        if found in ("asset", "simulation"):
+            way = (
+                "use it as it is, without importing" if found == "asset" else "import the mesh it was made of"
+            )
+            raise AssetError(f"{path} is already a gdpro {found}; {way}")
+    tell("reading the mesh")
+    mesh = load_mesh(path, texture=texture, color=color, up=up, scale=scale)
+    tell("binding Gaussians")
+    bound = bind_mesh(mesh, budget=budget, seed=seed)
+    provenance: dict[str, Any] = {
+        "source": path.name,
+        "sha256": mesh.sha256,
+        "seed": seed,
+        "options": {
+            "budget": budget,
+            "color": color,
+            "texture": None if texture is None else Path(texture).name,
+            "up": up,
+            "scale": scale,
+        },
+        "messages": list(mesh.messages),
+        "versions": versions(),
+    }
+    asset = Asset(
+        name=name if name is not None else path.stem,
+        gaussians=bound,
+        vertex_colors=vertex_colors(mesh, bound),
+        material=material,
+        provenance=provenance,
+    )
+    if tets:
+        asset = tetrahedralize_asset(
+            asset,
+            target_tets=target_tets,
+            edge_length=edge_length,
+            method=tet_method,
+            on_progress=on_progress,
+        )
+    log.info("imported %s: %d Gaussians on %d faces", path.name, len(bound), len(bound.faces))
+    return asset
+
+
+def tetrahedralize_asset(
+    asset: Asset,
+    *,
+    target_tets: int = 6_000,
+    edge_length: float | None = None,
+    method: str = "auto",
+    on_progress: Phase | None = None,
+) -> Asset:
+    """The asset with fresh tets around its mesh and the mesh embedded in them.
+
+    Options as in `gdpro_sim.meshing.tetrahedralize.tetrahedralize`; they are added to the provenance.
+    Raises MeshError.
+    """
+    tell: Phase = on_progress or (lambda phase: None)
+    vertices, faces = to_numpy(asset.gaussians.vertices), to_numpy(asset.gaussians.faces)
+    tell("filling with tetrahedra")
+    try:
+        tets = tetrahedralize(
+            vertices, faces, target_tets=target_tets, edge_length=edge_length, method=method
+        )
+    except MeshError as error:
+        raise MeshError(f"{asset.name}: {error}") from error
+    tell("embedding the surface")
+    embedding = embed_surface(tets, vertices)
+    made = {
+        "target_tets": target_tets,
+        "edge_length": edge_length,
+        "requested_method": method,
+        "method": tets.method,
+        "versions": versions(),
+    }
+    return replace(asset, tets=tets, embedding=embedding, provenance={**asset.provenance, "tets": made})
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of those that shape an import."""
+    found = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = "unknown"
+    return found
+
+
+__all__ = ["import_mesh", "tetrahedralize_asset", "versions"]
