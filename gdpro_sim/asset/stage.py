@@ -144,7 +144,7 @@ def open_root(layer: Sdf.Layer, path: str | Path, kind: FileKind) -> tuple[Usd.S
     """
     found, version = _signature(layer)
     if found != kind:
-        what = f"it holds a {found}" if found else "it has no `gdpro:kind`"
+        what = f"it holds {'an' if found == 'asset' else 'a'} {found}" if found else "it has no `gdpro:kind`"
         hint = "; make one of a mesh with `gdpro import`" if kind == "asset" and not found else ""
         raise AssetError(f"{path} is not a gdpro {kind} file: {what}{hint}")
     if version != FORMAT_VERSION:

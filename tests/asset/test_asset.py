@@ -313,12 +313,12 @@ def test_a_folder_without_permission_is_refused(tmp_path: Path, monkeypatch: pyt
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, suffix: str) -> None:
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
     """A limit on file size makes USD's own writes fail, as a full disk does."""
-    path = tmp_path / f"a{suffix}"
-    make_asset().save(path)
-    before = path.read_bytes()
+    paths = [tmp_path / f"a{suffix}" for suffix in SUFFIXES]
+    for path in paths:
+        make_asset().save(path)
+    before = [path.read_bytes() for path in paths]
     code = """
 import resource, sys
 from gdpro_sim.errors import OutputError
@@ -326,16 +326,19 @@ from tests.asset.sample import make_asset
 asset = make_asset(20_000)
 asset.gaussians.gaussians()
 resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, resource.RLIM_INFINITY))
-try:
-    asset.save(sys.argv[1])
-except OutputError as error:
-    print("REFUSED", error)
+for path in sys.argv[1:]:
+    try:
+        asset.save(path)
+    except OutputError as error:
+        print("REFUSED", error)
 """
     root = Path(__file__).resolve().parents[2]
-    done = subprocess.run([sys.executable, "-c", code, str(path)], cwd=root, capture_output=True, text=True)
-    assert "REFUSED cannot write" in done.stdout, done.stdout + done.stderr
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == [path.name]
+    command = [sys.executable, "-c", code, *map(str, paths)]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    for path in paths:
+        assert f"REFUSED cannot write {path}" in done.stdout, done.stdout + done.stderr
+    assert [path.read_bytes() for path in paths] == before
+    assert len(os.listdir(tmp_path)) == len(paths)
 
 
 def test_a_failing_rename_removes_the_temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,8 +6,8 @@ Blender (the `bpy` module) wants an environment of its own, without this package
     .venv/bin/python tests/benchmarks/open_in_blender.py --expect FILE.usdc        # writes FILE.npz
     blender/bin/python tests/benchmarks/open_in_blender.py FILE.usdc FILE.npz      # compares, frame by frame
 
-Prints the largest difference in metres per object and frame. Exits 1 where an object or an attribute is missing
-or a position differs by more than 1e-6 m.
+Prints the largest difference in metres per object and frame. Exits 1 where an object or an attribute is
+missing or a position differs by more than 1e-6 m.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def compare(path: Path, expected: Path | None) -> int:
     data = np.load(expected, allow_pickle=False)
     worst, failed = 0.0, False
     for frame in data["frames"]:
-        bpy.context.scene.frame_set(int(frame))
+        scene.frame_set(int(frame))
         graph = bpy.context.evaluated_depsgraph_get()
         line = []
         for kind, key in (("MESH", "mesh"), ("POINTCLOUD", "points")):
