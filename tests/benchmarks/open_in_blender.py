@@ -65,9 +65,8 @@ def compare(path: Path, expected: Path | None) -> int:
         # Imported in body order; Blender appends .001 and so on to repeated names.
         objects[kind].sort(key=lambda o: o.name)
         print(f"{kind}: {[o.name for o in objects[kind]]}")
-    print(
-        f"Blender {bpy.app.version_string}, frames {bpy.context.scene.frame_start}-{bpy.context.scene.frame_end}"
-    )
+    scene = bpy.context.scene
+    print(f"Blender {bpy.app.version_string}, frames {scene.frame_start}-{scene.frame_end}")
     if not (objects["MESH"] and objects["POINTCLOUD"]):
         print("FAILED: a mesh or a point cloud is missing")
         return 1

@@ -219,7 +219,7 @@ def test_requests_that_cannot_work_are_refused_at_once(tmp_path: Path, assets: d
 
 
 def test_a_full_disk_is_an_output_error(tmp_path: Path) -> None:
-    """A limit on file size makes USD's own writes fail, as a full disk does: while appending, and on closing."""
+    """A limit on file size makes USD's own writes fail, as a full disk does: on appending and on closing."""
     path = tmp_path / "s.usdc"
     path.write_text("old")
     code = """
