@@ -35,10 +35,10 @@ class ConjugateGradient:
     solution:          [P] vec3d
     """
 
-    def __init__(self, topology: Topology, device: str, *, serial_rows: int = SERIAL_ROWS) -> None:
+    def __init__(self, topology: Topology, device: str) -> None:
         self.device = device
         self.rows = len(topology.offsets) - 1
-        self.serial = device == "cpu" and self.rows <= serial_rows
+        self.serial = device == "cpu" and self.rows <= SERIAL_ROWS
         self.blocks = min(ROW_BLOCKS, self.rows) if device == "cpu" else self.rows
         self.offsets = wp.array(topology.offsets, dtype=wp.int32, device=device)
         self.columns = wp.array(topology.columns, dtype=wp.int32, device=device)
