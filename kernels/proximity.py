@@ -15,7 +15,8 @@ def closest_point(
     face_out: wp.array[int],
     barycentric_out: wp.array[wp.vec3],
 ):
-    """Nearest face of each point, and barycentric coordinates of the nearest point on it; face -1 for none."""
+    """Nearest face of each point, and barycentric coordinates of the nearest point on it; face -1 for
+    none."""
     i = start + wp.tid()
     query = wp.mesh_query_point_no_sign(mesh, points[i], 1.0e10)
     face_out[i] = -1
@@ -37,7 +38,8 @@ def closest_point_facing(
     face_out: wp.array[int],
     barycentric_out: wp.array[wp.vec3],
 ):
-    """As `closest_point`, but a face that looks away from `normals` loses to one along the normal within `reach`.
+    """As `closest_point`, but a face that looks away from `normals` loses to one along the normal within
+    `reach`.
 
     So a point of one side of a thin wall is not taken for the other side.
     """
@@ -65,6 +67,41 @@ def closest_point_facing(
                     v = hit.v
         face_out[i] = face
         barycentric_out[i] = wp.vec3(u, v, 1.0 - u - v)
+
+
+@wp.kernel
+def openness(
+    start: int,
+    # In:
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    rays: int,
+    lift: float,
+    reach: float,
+    # Out:
+    open_out: wp.array[float],
+):
+    """Share of cosine-weighted rays from a surface point that meet nothing within `reach`; rays start `lift`
+    above."""
+    i = start + wp.tid()
+    n = normals[i]
+    axis = wp.vec3(1.0, 0.0, 0.0)
+    if wp.abs(n[0]) > 0.8:
+        axis = wp.vec3(0.0, 1.0, 0.0)
+    t = wp.normalize(wp.cross(n, axis))
+    b = wp.cross(n, t)
+    origin = points[i] + n * lift
+    free = wp.int32(0)
+    for k in range(rays):
+        # A Fibonacci spiral on the disc, projected up to the hemisphere: even in cosine.
+        r2 = (float(k) + 0.5) / float(rays)
+        r = wp.sqrt(r2)
+        phi = 2.39996323 * float(k)
+        direction = t * (r * wp.cos(phi)) + b * (r * wp.sin(phi)) + n * wp.sqrt(1.0 - r2)
+        if not wp.mesh_query_ray_anyhit(mesh, origin, direction, reach):
+            free += 1
+    open_out[i] = float(free) / float(rays)
 
 
 @wp.kernel

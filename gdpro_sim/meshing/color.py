@@ -1,7 +1,7 @@
 """Colours of points on a surface: base colour times texture times corner colour.
 
-Stored colours are sRGB-encoded and stay so: a white base leaves texture bytes exactly as they are. Factors multiply
-in linear light (glTF 2.0, section 3.9.2), as every renderer of these formats does.
+Stored colours are sRGB-encoded and stay so: a white base leaves texture bytes exactly as they are. Factors
+multiply in linear light (glTF 2.0, section 3.9.2), as every renderer of these formats does.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class Texture:
         return self._levels[min(index, len(self._levels) - 1)]
 
     def sample(self, uv: np.ndarray, texels: np.ndarray | None = None) -> np.ndarray:
-        """Colours in [0, 1] float32 [N, C] at `uv` [N, 2] (v up), averaged over about `texels` [N] texels each."""
+        """Colours in [0, 1] float32 [N, C] at `uv` [N, 2] (v up), averaged over about `texels` [N] texels
+        each."""
         uv = np.where(np.isfinite(uv), uv, 0.0)
         if texels is None:
             return self._bilinear(0, uv)
@@ -98,7 +99,8 @@ class SurfaceColors:
     ) -> np.ndarray:
         """sRGB colour and opacity, float32 [N, 4] in [0, 1].
 
-        face_ids [N], barycentrics [N, 3]; `area` (m^2, scalar or [N]) is the patch a texture is averaged over.
+        face_ids [N], barycentrics [N, 3]; `area` (m^2, scalar or [N]) is the patch a texture is averaged
+        over.
         """
         mesh = self._mesh
         face_ids = np.asarray(face_ids)

@@ -19,8 +19,8 @@ CANDIDATES = 48
 def embed_surface(tetmesh: TetMesh, vertices: np.ndarray) -> Embedding:
     """Embed surface vertices [V, 3] m: the tet that holds each, or the nearest one, with unclamped weights.
 
-    A moved vertex is `einsum("vw,vwc->vc", weights, moved[tets[tet_ids]])`. At rest that gives the vertex back, for
-    vertices outside too, because weights extrapolate. Raises `MeshError` for non-finite vertices.
+    A moved vertex is `einsum("vw,vwc->vc", weights, moved[tets[tet_ids]])`. At rest that gives the vertex
+    back, for vertices outside too, because weights extrapolate. Raises `MeshError` for non-finite vertices.
     """
     points = np.asarray(vertices, np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -70,7 +70,8 @@ def _weights(inverse: np.ndarray, origin: np.ndarray, tet_ids: np.ndarray, point
 def _containing(
     corner: np.ndarray, inverse: np.ndarray, origin: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """The tet that holds each point, -1 for none: a uniform grid lists the tets whose boxes reach each cell."""
+    """The tet that holds each point, -1 for none: a uniform grid lists the tets whose boxes reach each
+    cell."""
     low, high = corner.min(1), corner.max(1)
     base = low.min(0)
     extent = np.maximum(high.max(0) - base, 1e-30)

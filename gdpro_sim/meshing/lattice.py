@@ -1,4 +1,5 @@
-"""A regular tetrahedral lattice around a surface: coarse, but it exists for any mesh that encloses something."""
+"""A regular tetrahedral lattice around a surface: coarse, but it exists for any mesh that encloses
+something."""
 
 from __future__ import annotations
 
@@ -11,14 +12,19 @@ from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.tetmesh import TetMesh
 
 LEAST_FILL = 0.05
-"""Fill of an element that the surface crosses but no sample falls in: it must carry the surface, so it keeps mass."""
+"""Fill of an element that the surface crosses but no sample falls in: it must carry the surface, so it keeps
+mass."""
 
 VOLUME_SAMPLES = 40_000
 TET_SAMPLES = 32
+NO_VOLUME = (
+    "the mesh encloses no volume (a sheet, or a surface with large openings); close it or give it thickness"
+)
 
 
 def _kuhn_tets() -> np.ndarray:
-    """Six tets of the unit cube along its main diagonal (Kuhn 1960), corners as offsets; [6, 4, 3], positive volumes.
+    """Six tets of the unit cube along its main diagonal (Kuhn 1960), corners as offsets; [6, 4, 3], positive
+    volumes.
 
     Tet of axis order (a, b, c) holds the points whose local coordinates obey x_a >= x_b >= x_c.
     """
@@ -40,11 +46,12 @@ KUHN_ORDER = {order: i for i, order in enumerate(itertools.permutations(range(3)
 def lattice(
     vertices: np.ndarray, faces: np.ndarray, *, target_tets: int, edge_length: float | None = None
 ) -> TetMesh:
-    """Cubes of six tets each wherever the surface or its inside is; `fill` is each tet's share inside the surface.
+    """Cubes of six tets each wherever the surface or its inside is; `fill` is each tet's share inside the
+    surface.
 
-    Inside means a generalised winding number above one half (Jacobson et al. 2013), so open and self-intersecting
-    surfaces work. `edge_length` (m) is the cube's edge; without it, it is chosen for about `target_tets`.
-    Raises `MeshError` when the surface encloses nothing.
+    Inside means a generalised winding number above one half (Jacobson et al. 2013), so open and
+    self-intersecting surfaces work. `edge_length` (m) is the cube's edge; without it, it is chosen for about
+    `target_tets`. Raises `MeshError` when the surface encloses nothing.
     """
     v = np.asarray(vertices, np.float64)
     low, high = v.min(0), v.max(0)
@@ -53,9 +60,7 @@ def lattice(
         probes = low + np.random.default_rng(0).random((VOLUME_SAMPLES, 3)) * (high - low)
         volume = float(index.inside(probes).mean() * np.prod(high - low))
         if volume <= 0.0:
-            raise MeshError(
-                "the mesh encloses no volume (a sheet, or a surface with large openings); close it or give it thickness"
-            )
+            raise MeshError(NO_VOLUME)
         edge_length = (6.0 * volume / target_tets) ** (1.0 / 3.0)
         for _ in range(12):
             tets, origin = _cells(v, faces, index, edge_length)
@@ -82,7 +87,8 @@ def _surface_points(v: np.ndarray, faces: np.ndarray, size: float) -> np.ndarray
 def _cells(
     v: np.ndarray, faces: np.ndarray, index: SurfaceIndex, size: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cubes [C, 3] (integer coordinates) that hold inside or surface points, and the lattice's origin [3] m."""
+    """Cubes [C, 3] (integer coordinates) that hold inside or surface points, and the lattice's origin [3]
+    m."""
     low, high = v.min(0), v.max(0)
     shape = np.maximum(np.ceil((high - low) / size - 1e-9), 1).astype(np.int64)
     if int(shape.prod()) > 20_000_000:
@@ -106,8 +112,8 @@ def _fill(
     unique, tets = np.unique(keys, return_inverse=True)
     tets = tets.reshape(-1, 4)
     nodes = origin + np.stack(np.unravel_index(unique, tuple(stride)), 1) * size
-    # Uniform barycentric weights are the gaps between sorted uniforms. Drawn anew for each tet: a common pattern
-    # would be biased wherever the surface runs along the lattice.
+    # Uniform barycentric weights are the gaps between sorted uniforms. Drawn anew for each tet: a common
+    # pattern would be biased wherever the surface runs along the lattice.
     cuts = np.sort(np.random.default_rng(0).random((len(tets), TET_SAMPLES, 3)), axis=2)
     weights = np.diff(cuts, axis=2, prepend=0.0, append=1.0)
     samples = np.einsum("tsw,twc->tsc", weights, nodes[tets])
@@ -124,9 +130,7 @@ def _fill(
     touched = np.zeros(len(tets), bool)
     touched[(owner * 6 + which)[owner >= 0]] = True
     if not (fill > 0.0).any():
-        raise MeshError(
-            "the mesh encloses no volume (a sheet, or a surface with large openings); close it or give it thickness"
-        )
+        raise MeshError(NO_VOLUME)
     keep = (fill > 0.0) | touched
     fill = np.maximum(fill, LEAST_FILL)[keep]
     used, compact = np.unique(tets[keep], return_inverse=True)

@@ -53,12 +53,12 @@ def load_mesh(
     path:    OBJ, glTF, PLY, STL, OFF, COLLADA, 3MF or USD; scenes are flattened with their transforms
     texture: image to use instead of the file's own; needs UV coordinates in the file
     color:   one colour for everything ("#rrggbb" or a CSS name) instead of the file's own colours
-    up:      vertical axis, "y" or "z"; "auto" takes what the file declares, else Z for STL, PLY, OFF and 3MF and Y
-             for the rest
+    up:      vertical axis, "y" or "z"; "auto" takes what the file declares, else Z for STL, PLY, OFF and 3MF
+             and Y for the rest
     scale:   multiplies lengths, after the unit the file declares (USD, COLLADA and 3MF do; others are metres)
 
-    Vertices are welded by position, zero-area and duplicate faces dropped, winding made consistent and normals
-    turned outward; `SurfaceMesh.messages` tells what was done, and warns about a doubtful size.
+    Vertices are welded by position, zero-area and duplicate faces dropped, winding made consistent and
+    normals turned outward; `SurfaceMesh.messages` tells what was done, and warns about a doubtful size.
     Raises `MeshError` for a missing, unreadable, empty, broken or too large file, naming it and the way out.
     """
     path = Path(path)
@@ -135,8 +135,8 @@ def check_file(path: Path) -> None:
     limit = MAX_BINARY_BYTES if suffix in BINARY_SUFFIXES else MAX_TEXT_BYTES
     if size > limit:
         raise MeshError(
-            f"{path}: {size / 1e6:.0f} MB is above the limit of {limit / 1e6:.0f} MB for {suffix}; decimate the mesh "
-            f"to at most {MAX_FACES:,} faces first"
+            f"{path}: {size / 1e6:.0f} MB is above the limit of {limit / 1e6:.0f} MB for {suffix}; "
+            f"decimate the mesh to at most {MAX_FACES:,} faces first"
         )
 
 
@@ -264,7 +264,8 @@ def _finish(part: RawPart, path: Path, raw: RawMesh) -> SurfaceMesh:
     report = validate(vertices, faces)
     if report.boundary_edges or report.non_manifold_edges:
         messages.append(
-            f"the surface is not closed: {report.boundary_edges} open and {report.non_manifold_edges} non-manifold edges"
+            f"the surface is not closed: {report.boundary_edges} open and {report.non_manifold_edges} "
+            "non-manifold edges"
         )
     diagonal = float(np.linalg.norm(np.ptp(vertices.astype(np.float64), axis=0)))
     if diagonal > LARGEST_DIAGONAL or diagonal < SMALLEST_DIAGONAL:
@@ -288,8 +289,8 @@ def _size_warning(diagonal: float) -> str:
     if diagonal < SMALLEST_DIAGONAL:
         factor = 1000.0 if diagonal * 1000.0 >= 0.005 else factor
     return (
-        f"warning: the mesh is {diagonal:.4g} m across, which is doubtful; `--scale {factor:g}` would make it "
-        f"{diagonal * factor:.3g} m"
+        f"warning: the mesh is {diagonal:.4g} m across, which is doubtful; `--scale {factor:g}` would make "
+        f"it {diagonal * factor:.3g} m"
     )
 
 

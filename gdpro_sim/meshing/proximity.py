@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+
+RAY_LIFT = 1e-3
+"""How far above the surface its own rays start, as a share of the bounding box's diagonal."""
 
 
 class SurfaceIndex:
     """A triangle surface ready for closest-point and inside queries.
 
-    Queries run in float32 after centring and scaling the mesh to unit size, so that a small or far-away mesh loses
-    no precision. vertices [V, 3] m, faces [F, 3].
+    Queries run in float32 after centring and scaling the mesh to unit size, so that a small or far-away mesh
+    loses no precision. vertices [V, 3] m, faces [F, 3].
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, winding: bool = False) -> None:
@@ -35,8 +40,8 @@ class SurfaceIndex:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Nearest face [N] int32 and barycentric coordinates [N, 3] float32 of the nearest point on it.
 
-        With unit `normals` [N, 3], a face on the other side of a thin wall gives way to one that looks the same way
-        and lies along the normal within `reach` metres.
+        With unit `normals` [N, 3], a face on the other side of a thin wall gives way to one that looks the
+        same way and lies along the normal within `reach` metres.
         """
         import warp as wp
 
@@ -46,7 +51,7 @@ class SurfaceIndex:
         count = len(points)
         face = wp.empty(count, dtype=wp.int32, device="cpu")
         barycentric = wp.empty(count, dtype=wp.vec3, device="cpu")
-        where = wp.array(self._unit(points), dtype=wp.vec3, device="cpu")
+        where: Any = wp.array(self._unit(points), dtype=wp.vec3, device="cpu")
         if normals is None:
             launch_chunked(
                 kernels.closest_point, count, [self._mesh.id, where], [face, barycentric], device="cpu"
@@ -67,8 +72,28 @@ class SurfaceIndex:
         weights = np.clip(barycentric.numpy(), 0.0, 1.0)
         return face.numpy(), weights / weights.sum(1, keepdims=True)
 
+    def openness(
+        self, points: np.ndarray, normals: np.ndarray, *, reach: float, rays: int = 64
+    ) -> np.ndarray:
+        """Share in [0, 1] of the hemisphere over each surface point with nothing in it within `reach` m; [N].
+
+        points [N, 3] m on the surface, unit normals [N, 3]. Cosine-weighted: 1 minus ambient occlusion.
+        """
+        import warp as wp
+
+        from gdpro_sim.device import launch_chunked
+        from gdpro_sim.kernels import proximity as kernels
+
+        out = wp.empty(len(points), dtype=wp.float32, device="cpu")
+        where: Any = wp.array(self._unit(points), dtype=wp.vec3, device="cpu")
+        up: Any = wp.array(np.ascontiguousarray(normals, np.float32), dtype=wp.vec3, device="cpu")
+        inputs = [self._mesh.id, where, up, rays, RAY_LIFT, float(reach * self._scale)]
+        launch_chunked(kernels.openness, len(points), inputs, [out], device="cpu")
+        return out.numpy()
+
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Whether each point lies inside by the generalised winding number (> 1/2), open meshes too; bool [N].
+        """Whether each point lies inside by the generalised winding number (> 1/2), open meshes too; bool
+        [N].
 
         The index must have been made with `winding=True`.
         """
@@ -78,7 +103,7 @@ class SurfaceIndex:
         from gdpro_sim.kernels import proximity as kernels
 
         flag = wp.empty(len(points), dtype=wp.int32, device="cpu")
-        where = wp.array(self._unit(points), dtype=wp.vec3, device="cpu")
+        where: Any = wp.array(self._unit(points), dtype=wp.vec3, device="cpu")
         launch_chunked(kernels.inside, len(points), [self._mesh.id, where], [flag], device="cpu")
         return flag.numpy() > 0
 

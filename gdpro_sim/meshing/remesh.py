@@ -11,9 +11,9 @@ from gdpro_sim.meshing.repair import check_arrays, clean, edge_keys
 def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
     """Quadric decimation (fast-simplification) to about `target_faces` triangles, cleaned afterwards.
 
-    Takes vertices [V, 3] m and faces [F, 3]; returns the same kinds as float32 and int32. A mesh that has no more
-    faces than asked comes back cleaned. Colours do not travel with the triangles: look them up on the original
-    surface at the closest point (`gdpro_sim.meshing.proximity.project`).
+    Takes vertices [V, 3] m and faces [F, 3]; returns the same kinds as float32 and int32. A mesh that has no
+    more faces than asked comes back cleaned. Colours do not travel with the triangles: look them up on the
+    original surface at the closest point (`gdpro_sim.meshing.proximity.project`).
     Raises `MeshError` when nothing is left.
     """
     import fast_simplification
@@ -44,11 +44,12 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
 def subdivide(
     vertices: np.ndarray, faces: np.ndarray, max_edge: float, *, max_faces: int = 4_000_000
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Split edges longer than `max_edge` metres at their midpoint, in all faces that share them: no T-junctions.
+    """Split edges longer than `max_edge` metres at their midpoint, in all faces that share them: no
+    T-junctions.
 
-    Returns vertices [V', 3] float32 (the old ones first), faces [F', 3] int32, parents [F'] int32 (the original
-    face of each) and corners [F', 3, 3] float32 (barycentric coordinates of each corner in its parent, so any
-    per-corner attribute is `einsum("fcp,fp...->fc...", corners, attribute[parents])`).
+    Returns vertices [V', 3] float32 (the old ones first), faces [F', 3] int32, parents [F'] int32 (the
+    original face of each) and corners [F', 3, 3] float32 (barycentric coordinates of each corner in its
+    parent, so any per-corner attribute is `einsum("fcp,fp...->fc...", corners, attribute[parents])`).
     Raises `MeshError` when more than `max_faces` would be needed.
     """
     check_arrays(vertices, faces)

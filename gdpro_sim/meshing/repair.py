@@ -71,7 +71,8 @@ def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def edge_keys(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Undirected edge of each half edge as one int64 key, and whether it runs from the lower index; [3F] each.
+    """Undirected edge of each half edge as one int64 key, and whether it runs from the lower index; [3F]
+    each.
 
     Half edge 3 f + i of face f runs from corner i to corner (i + 1) mod 3.
     """
@@ -250,8 +251,8 @@ def _winding_number(point: np.ndarray, triangles: np.ndarray) -> float:
 def outward_orientation(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Mask of faces to turn so that normals point outward; bool [F].
 
-    Pieces are connected over manifold edges. Every piece is turned whose volume is negative, except a cavity: a
-    piece inside another one.
+    Pieces are connected over manifold edges. Every piece is turned whose volume is negative, except a cavity:
+    a piece inside another one.
     """
     labels = consistent_winding(faces)[1]
     v = np.asarray(vertices, np.float64)
@@ -260,8 +261,8 @@ def outward_orientation(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     normals = face_normals(vertices, faces)
     sizes = np.bincount(labels, minlength=count)
     centroid = v[faces].mean(1)
-    centres = np.stack([np.bincount(labels, weights=centroid[:, i], minlength=count) for i in range(3)], 1)
-    centres /= np.maximum(sizes, 1)[:, None]
+    sums = np.stack([np.bincount(labels, weights=centroid[:, i], minlength=count) for i in range(3)], 1)
+    centres = sums / np.maximum(sizes, 1)[:, None]
     flux = np.einsum("fc,fc->f", v[faces[:, 0]] - centres[labels], normals)
     volumes = np.bincount(labels, weights=flux, minlength=count) / 6.0
     scale = np.bincount(labels, weights=np.linalg.norm(normals, axis=1), minlength=count) ** 1.5
@@ -290,7 +291,8 @@ def turn_faces(faces: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def clean(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weld, drop degenerate and duplicate faces, agree on winding and turn normals outward.
 
-    For arrays without attributes; `load_mesh` does the same with them. Raises `MeshError` when nothing is left.
+    For arrays without attributes; `load_mesh` does the same with them. Raises `MeshError` when nothing is
+    left.
     """
     check_arrays(vertices, faces)
     v, f = weld(np.asarray(vertices), np.asarray(faces))

@@ -65,7 +65,8 @@ class SurfaceMesh:
         for name, array, shape, dtype in wanted:
             if array is not None and (array.shape != shape or array.dtype != dtype):
                 raise MeshError(
-                    f"SurfaceMesh.{name} must be {np.dtype(dtype).name} {shape}, got {array.dtype} {array.shape}"
+                    f"SurfaceMesh.{name} must be {np.dtype(dtype).name} {shape}, "
+                    f"got {array.dtype} {array.shape}"
                 )
         if not self.materials:
             raise MeshError("SurfaceMesh.materials must hold at least one material")
@@ -76,7 +77,8 @@ class SurfaceMesh:
     def from_arrays(
         vertices: np.ndarray, faces: np.ndarray, *, color: tuple[float, float, float] = DEFAULT_COLOR
     ) -> SurfaceMesh:
-        """A mesh of one plain sRGB `color` from vertices [V, 3] m and faces [F, 3]; taken as it is, not cleaned."""
+        """A mesh of one plain sRGB `color` from vertices [V, 3] m and faces [F, 3]; taken as it is, not
+        cleaned."""
         return SurfaceMesh(
             np.ascontiguousarray(vertices, dtype=np.float32),
             np.ascontiguousarray(faces, dtype=np.int32),

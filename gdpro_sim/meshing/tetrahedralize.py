@@ -25,10 +25,12 @@ logger = logging.getLogger(__name__)
 METHODS = ("auto", "tetwild", "lattice")
 
 SURFACE_SHARE = 1.5
-"""fTetWild makes about this many times the tets that regular ones of the edge length would: the surface costs more."""
+"""fTetWild makes about this many times the tets that regular ones of the edge length would: the surface costs
+more."""
 
 EPSILON = 5e-3
-"""Default envelope over the bounding box's diagonal: a fifth of the time of 1e-3, a volume within 1 to 2 %."""
+"""Default envelope over the bounding box's diagonal: a fifth of the time of 1e-3, a volume within 1 to 2
+%."""
 
 LEAST_PIECE = 1e-3
 MEMORY = 8 << 30
@@ -54,12 +56,13 @@ def tetrahedralize(
     target_tets: about how many; ignored when `edge_length` (m) is given
     epsilon:     how far the tets' surface may lie from the mesh, as a share of the bounding box's diagonal
     time_limit:  seconds fTetWild may take before it is ended
-    method:      "tetwild", "lattice", or "auto": fTetWild (Hu et al. 2020), and on its failure the lattice, with a
-                 warning in the log and `TetMesh.method == "lattice"`
+    method:      "tetwild", "lattice", or "auto": fTetWild (Hu et al. 2020), and on its failure the lattice,
+                 with a warning in the log and `TetMesh.method == "lattice"`
 
-    The surface is decimated to about the tets' resolution first. Open, self-intersecting and flipped meshes work.
-    fTetWild is not deterministic: keep its result. Raises `MeshError` for broken arrays, a flat mesh, a mesh that
-    encloses nothing, and (method "tetwild") when fTetWild fails or runs out of time.
+    The surface is decimated to about the tets' resolution first. Open, self-intersecting and flipped meshes
+    work.
+    fTetWild is not deterministic: keep its result. Raises `MeshError` for broken arrays, a flat mesh, a mesh
+    that encloses nothing, and (method "tetwild") when fTetWild fails or runs out of time.
     """
     if method not in METHODS:
         raise MeshError(f"tetrahedralization method must be one of {', '.join(METHODS)}, got {method!r}")
@@ -133,8 +136,8 @@ def _tetwild(
     )
     if not len(tets):
         raise TetwildError(
-            "fTetWild returned no tets: the mesh encloses no volume it can see (a sheet, or walls thinner than "
-            f"{2.0 * (epsilon or EPSILON) * diagonal:.2g} m); give it thickness or lower epsilon"
+            "fTetWild returned no tets: the mesh encloses no volume it can see (a sheet, or walls thinner "
+            f"than {2.0 * (epsilon or EPSILON) * diagonal:.2g} m); give it thickness or lower epsilon"
         )
     if tets.min() < 0 or tets.max() >= len(points) or not np.isfinite(points).all():
         raise TetwildError("fTetWild returned a broken mesh; repair the input, or use method='lattice'")
@@ -149,8 +152,9 @@ def run_tetwild(
 ) -> tuple[np.ndarray, np.ndarray]:
     """fTetWild on valid arrays in a subprocess; vertices float64 [P, 3] and tets int32 [T, 4], unchecked.
 
-    `edge_length` and `epsilon` are shares of the bounding box's diagonal. The process is killed at `time_limit`
-    seconds and on any interruption. Raises `MeshError` for a time-out, a crash or an error inside it.
+    `edge_length` and `epsilon` are shares of the bounding box's diagonal. The process is killed at
+    `time_limit` seconds and on any interruption. Raises `MeshError` for a time-out, a crash or an error
+    inside it.
     """
     with tempfile.TemporaryDirectory(prefix="gdpro-tet-") as folder:
         source, target = Path(folder, "in.npz"), Path(folder, "out.npz")
@@ -171,8 +175,8 @@ def run_tetwild(
             _, errors = process.communicate(timeout=time_limit)
         except subprocess.TimeoutExpired:
             raise TetwildError(
-                f"fTetWild passed its time limit of {time_limit:g} s; raise the limit, simplify the mesh, or use "
-                "method='lattice'"
+                f"fTetWild passed its time limit of {time_limit:g} s; raise the limit, simplify the mesh, or "
+                "use method='lattice'"
             ) from None
         finally:
             if process.poll() is None:
@@ -231,8 +235,8 @@ def _compare_volume(v: np.ndarray, f: np.ndarray, mesh: TetMesh) -> None:
     total = float(mesh.volumes().sum())
     if report.watertight and abs(total - report.volume) > 0.15 * abs(report.volume):
         logger.warning(
-            "the tets hold %.4g m^3 but the surface encloses %.4g m^3; overlapping parts or thin walls differ that "
-            "much, more tets or a smaller epsilon may help",
+            "the tets hold %.4g m^3 but the surface encloses %.4g m^3; overlapping parts or thin walls "
+            "differ that much, more tets or a smaller epsilon may help",
             total,
             report.volume,
         )

@@ -1,8 +1,9 @@
 """Runs fTetWild in a process of its own: `python -m gdpro_sim.meshing.tetwild_worker in.npz out.npz`.
 
-fTetWild can crash, run for ever or eat the memory on hostile input; here none of it reaches the caller. The input
-holds `vertices` float64 [V, 3], `faces` int32 [F, 3], `edge_length` and `epsilon` relative to the bounding box's
-diagonal, `seconds` and `bytes`; the output holds `vertices` float64 [P, 3] and `tets` int32 [T, 4].
+fTetWild can crash, run for ever or eat the memory on hostile input; here none of it reaches the caller. The
+input holds `vertices` float64 [V, 3], `faces` int32 [F, 3], `edge_length` and `epsilon` relative to the
+bounding box's diagonal, `seconds` and `bytes`; the output holds `vertices` float64 [P, 3] and `tets` int32
+[T, 4].
 """
 
 from __future__ import annotations

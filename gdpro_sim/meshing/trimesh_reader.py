@@ -32,7 +32,8 @@ def read_trimesh(path: Path) -> RawMesh:
     except BaseException as error:  # trimesh raises whatever its parsers raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(
-            f"{path}: cannot be read as {kind[1:].upper()} ({reason[:200]}); the file is damaged or not {kind}"
+            f"{path}: cannot be read as {kind[1:].upper()} ({reason[:200]}); "
+            f"the file is damaged or not {kind}"
         ) from error
     clouds = 0
     nodes = [(node, scene.graph[node]) for node in sorted(scene.graph.nodes_geometry)]
@@ -66,7 +67,7 @@ def read_trimesh(path: Path) -> RawMesh:
 def _part(mesh: Any, transform: np.ndarray, kind: str, name: str, messages: list[str]) -> RawPart:
     vertices = np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces, np.int64)
-    inside = ((faces >= 0) & (faces < len(vertices))).all(1)
+    inside = np.all((faces >= 0) & (faces < len(vertices)), axis=1)
     if not inside.all():
         bad = int((~inside).sum())
         if bad > 0.01 * len(faces):

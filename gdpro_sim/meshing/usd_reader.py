@@ -1,4 +1,5 @@
-"""Triangle meshes out of USD stages: transforms, axes, units, polygons, displayColor and simple preview surfaces."""
+"""Triangle meshes out of USD stages: transforms, axes, units, polygons, displayColor and simple preview
+surfaces."""
 
 from __future__ import annotations
 
@@ -18,9 +19,9 @@ UV_NAMES = ("st", "UVMap", "st0", "map1", "uv")
 def read_usd(path: Path) -> RawMesh:
     """Read every visible render mesh of a stage at its first time code.
 
-    Transforms are composed, left-handed meshes and mirrored transforms turned, polygons triangulated. Points keep
-    the stage's axes and units; `RawMesh.up` and `.unit` say which. Raises `MeshError` when the stage cannot be
-    opened or holds no mesh.
+    Transforms are composed, left-handed meshes and mirrored transforms turned, polygons triangulated. Points
+    keep the stage's axes and units; `RawMesh.up` and `.unit` say which. Raises `MeshError` when the stage
+    cannot be opened or holds no mesh.
     """
     from pxr import Tf, Usd, UsdGeom
 
@@ -122,8 +123,8 @@ def triangulate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangles as positions in `corners` [T, 3], and the polygon each came from [T]; in polygon order.
 
-    Quads split along the diagonal that keeps both halves facing the same way, larger polygons by ear clipping.
-    Polygons of fewer than three corners are dropped.
+    Quads split along the diagonal that keeps both halves facing the same way, larger polygons by ear
+    clipping. Polygons of fewer than three corners are dropped.
     """
     start = np.cumsum(sizes) - sizes
     parts, polygons = [], []
@@ -150,7 +151,8 @@ def triangulate(
 
 
 def _clip_ears(points: np.ndarray) -> np.ndarray:
-    """Ear clipping of one simple polygon [n, 3] projected along its normal; falls back to a fan. [n - 2, 3]."""
+    """Ear clipping of one simple polygon [n, 3] projected along its normal; falls back to a fan. [n - 2,
+    3]."""
     following = np.roll(points, -1, axis=0)
     normal = np.cross(points - points[0], following - points[0]).sum(0)
     axis = int(np.argmax(np.abs(normal)))
@@ -183,7 +185,8 @@ def _clip_ears(points: np.ndarray) -> np.ndarray:
 def _corner_values(
     primvar: Any, time: Any, local: np.ndarray, polygon: np.ndarray, corners: np.ndarray
 ) -> np.ndarray | None:
-    """A primvar at every triangle corner [T, 3, C], whatever its interpolation; None where sizes do not fit."""
+    """A primvar at every triangle corner [T, 3, C], whatever its interpolation; None where sizes do not
+    fit."""
     from pxr import UsdGeom
 
     values = primvar.ComputeFlattened(time)
@@ -247,7 +250,8 @@ def _uv(
 
 
 def _materials(prim: Any, polygon: np.ndarray, messages: list[str]) -> tuple[list[MeshMaterial], np.ndarray]:
-    """Bound materials, subsets included, and the material of each triangle. A nameless one stands for none."""
+    """Bound materials, subsets included, and the material of each triangle. A nameless one stands for
+    none."""
     from pxr import UsdGeom, UsdShade
 
     materials = [_material(prim, messages)]
