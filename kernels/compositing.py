@@ -14,7 +14,6 @@ Up to four channels are blended at once; more channels run again over the same l
 """
 
 import warp as wp
-
 from gdpro_sim.kernels.projection import BOX, FACTOR, LOG2_CUTOFF, LOG2_OPACITY, MEAN, REACH, RECORD, TILE
 
 wp.set_module_options(
@@ -152,7 +151,8 @@ _TILE_SNIPPET = f"""
             const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
             float* const out = image_out.data + pixel * image_channels + first_channel;
             for (int i = 0; i < count; ++i) {{
-                out[i] = i == divided ? sum[i] / (alpha > 1e-10f ? alpha : 1e-10f) : sum[i] + t * background[i];
+                out[i] = sum[i] + t * background[i];
+                if (i == divided) out[i] = sum[i] / (alpha > 1e-10f ? alpha : 1e-10f);
             }}
             transmittance_out.data[pixel] = t;
             alphas_out.data[pixel] = alpha;
@@ -211,7 +211,7 @@ def composite_tile(
     transmittance_out: wp.array[float],
     stops_out: wp.array[int],
 ):
-    """Blend `count` (at most 4) channels, `channels[g, channel_offset + j]`, into image channels first_channel + j.
+    """Blend channel `channels[g, channel_offset + j]` into image channel first_channel + j, j < count <= 4.
 
     `divided` is the one divided by alpha (expected depth), or -1. `stops_out` holds the list position
     where a tile had nothing left to blend.
@@ -284,10 +284,10 @@ def composite_pixel(
     if x >= width or y >= height:
         return
 
-    transmittance = float(1.0)
+    transmittance = wp.float32(1.0)
     blended = wp.vec4(0.0, 0.0, 0.0, 0.0)
     begin = offsets[tile]
-    last = int(begin)
+    last = wp.int32(begin)
     for at in range(begin, offsets[tile + 1]):
         g = ids[at]
         power = log2_alpha(records, g, float(x) + 0.5, float(y) + 0.5)

@@ -11,13 +11,12 @@ Every Gaussian seen by a camera becomes one record of 16 float32 (a 64-byte cach
     CHANNELS      4  the first four channels to blend
     BOX           2  half extents in pixels of the box outside which alpha < 1/255
     REACH         1  square of: distance in (u, v) at which alpha = 1/255, plus half a 4 x 4 block's diagonal
-    COMPENSATION  1  sqrt(det covariance / det blurred covariance)
+    COMPENSATION  1  sqrt(det covariance / det blurred covariance) where antialiased, else 1
 
 Culled Gaussians have a record of zeros, an empty rectangle and an infinite sort key.
 """
 
 import warp as wp
-
 from gdpro_sim.kernels.harmonics import harmonics_sum
 
 wp.set_module_options(
@@ -28,6 +27,8 @@ wp.set_module_options(
         "cpu_compiler_flags": "-march=native",
     }
 )
+
+vec4s = wp.types.vector(length=4, dtype=wp.int16)
 
 RECORD = wp.constant(16)
 MEAN = wp.constant(0)
@@ -49,6 +50,8 @@ LOG2_CUTOFF = wp.constant(-7.994353436858858)
 HALF_LOG2_E = wp.constant(0.7213475204444817)
 """exp(-q / 2) = exp2(-HALF_LOG2_E q)."""
 
+SQRT_HALF_LOG2_E = wp.constant(0.8493218002880191)
+
 SLACK = wp.constant(1.0001)
 """Boxes grow by this factor so that rounding cannot push a pixel at the cutoff outside."""
 
@@ -57,15 +60,15 @@ SLACK = wp.constant(1.0001)
 def rotation_of(quat: wp.vec4) -> wp.mat33:
     """Rotation matrix of a quaternion wxyz of any nonzero length; NaN for zero."""
     q = quat / wp.max(wp.abs(quat))
-    q = q / wp.length(q)
+    q = q * wp.sqrt(2.0 / wp.dot(q, q))
     w = q[0]
     x = q[1]
     y = q[2]
     z = q[3]
     return wp.mat33(
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+        1.0 - (y * y + z * z), x * y - w * z, x * z + w * y,
+        x * y + w * z, 1.0 - (x * x + z * z), y * z - w * x,
+        x * z - w * y, y * z + w * x, 1.0 - (x * x + y * y),
     )  # fmt: skip
 
 
@@ -84,16 +87,17 @@ def camera_point(viewmat: wp.mat44, mean: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def linearization_point(p: wp.vec3, k: wp.mat33, width: float, height: float) -> wp.vec3:
-    """The point at which perspective is linearized: p, pulled to at most 0.15 image widths past the border.
+def visible(rect: vec4s) -> bool:
+    return rect[2] > wp.int16(0)
 
-    Farther out the linearization would blow a Gaussian up (as in the 3D Gaussian Splatting code).
-    """
-    margin_x = 0.15 * width / k[0, 0]
-    margin_y = 0.15 * height / k[1, 1]
-    x = wp.clamp(p[0] / p[2], -k[0, 2] / k[0, 0] - margin_x, (width - k[0, 2]) / k[0, 0] + margin_x)
-    y = wp.clamp(p[1] / p[2], -k[1, 2] / k[1, 1] - margin_y, (height - k[1, 2]) / k[1, 1] + margin_y)
-    return wp.vec3(x * p[2], y * p[2], p[2])
+
+@wp.func
+def clear(i: int, records_out: wp.array2d[float], radii_out: wp.array[wp.vec2i], rects_out: wp.array[vec4s]):
+    """Write the record of a culled Gaussian."""
+    for j in range(RECORD):
+        records_out[i, j] = 0.0
+    radii_out[i] = wp.vec2i(0, 0)
+    rects_out[i] = vec4s(wp.int16(0))
 
 
 @wp.kernel
@@ -116,7 +120,7 @@ def project(
     # Out:
     records_out: wp.array2d[float],
     radii_out: wp.array[wp.vec2i],
-    rects_out: wp.array[wp.vec4i],
+    rects_out: wp.array[vec4s],
     keys_out: wp.array2d[float],
     order_out: wp.array2d[int],
 ):
@@ -127,27 +131,33 @@ def project(
     viewmat = viewmats[camera]
     k = intrinsics[camera]
 
-    for j in range(RECORD):
-        records_out[i, j] = 0.0
-    radii_out[i] = wp.vec2i(0, 0)
-    rects_out[i] = wp.vec4i(0, 0, 0, 0)
     keys_out[camera, n] = wp.inf
     order_out[camera, n] = i
 
     p = camera_point(viewmat, means[n])
     z = p[2]
     if not (z >= near and z <= far and z > 0.0):
+        clear(i, records_out, radii_out, rects_out)
         return
-    mean_x = (k[0, 0] * p[0] + k[0, 1] * p[1]) / z + k[0, 2]
-    mean_y = k[1, 1] * p[1] / z + k[1, 2]
+    offset_x = (k[0, 0] * p[0] + k[0, 1] * p[1]) / z
+    offset_y = k[1, 1] * p[1] / z
+    mean_x = offset_x + k[0, 2]
+    mean_y = offset_y + k[1, 2]
+
+    # Perspective is linearized at the mean, pulled to at most 0.15 image sizes outside the image: farther out
+    # the linearization would blow Gaussians up (as in the code of 3D Gaussian Splatting).
+    margin_x = 0.15 * float(width)
+    margin_y = 0.15 * float(height)
+    offset_x = wp.clamp(offset_x, -k[0, 2] - margin_x, float(width) - k[0, 2] + margin_x)
+    offset_y = wp.clamp(offset_y, -k[1, 2] - margin_y, float(height) - k[1, 2] + margin_y)
+    row_x = wp.vec3(k[0, 0], k[0, 1], -offset_x) / z
+    row_y = wp.vec3(0.0, k[1, 1], -offset_y) / z
 
     # 2D covariance M M^T of the rows m_x, m_y of M = J R_view R S.
-    q = linearization_point(p, k, float(width), float(height))
-    row_x = wp.vec3(k[0, 0] / z, k[0, 1] / z, -(k[0, 0] * q[0] + k[0, 1] * q[1]) / (z * z))
-    row_y = wp.vec3(0.0, k[1, 1] / z, -k[1, 1] * q[1] / (z * z))
-    axes = wp.transpose(view_rotation(viewmat) * rotation_of(quats[n]))
-    m_x = wp.cw_mul(axes * row_x, scales[n])
-    m_y = wp.cw_mul(axes * row_y, scales[n])
+    to_camera = wp.transpose(view_rotation(viewmat))
+    to_axes = wp.transpose(rotation_of(quats[n]))
+    m_x = wp.cw_mul(to_axes * (to_camera * row_x), scales[n])
+    m_y = wp.cw_mul(to_axes * (to_camera * row_y), scales[n])
     xx = wp.dot(m_x, m_x)
     yy = wp.dot(m_y, m_y)
     xy = wp.dot(m_x, m_y)
@@ -155,39 +165,37 @@ def project(
     normal = wp.cross(m_x, m_y)
     det = wp.dot(normal, normal)
     det_blurred = det + eps2d * (xx + yy) + eps2d * eps2d
-    xx += eps2d
-    yy += eps2d
+    deviation_x = wp.sqrt(xx + eps2d)
+    deviation_y = wp.sqrt(yy + eps2d)
 
-    compensation = wp.sqrt(det / det_blurred)
-    opacity = opacities[n]
+    compensation = wp.float32(1.0)
     if antialiased:
-        opacity *= compensation
+        compensation = wp.sqrt(det / det_blurred)
+    opacity = opacities[n] * compensation
     log2_opacity = wp.log2(opacity)
-    reach = log2_opacity - LOG2_CUTOFF
-    if not (reach >= 0.0):
-        return
+    extent2 = log2_opacity - LOG2_CUTOFF
+    extent = wp.sqrt(extent2)
 
-    a = wp.sqrt(HALF_LOG2_E * yy / det_blurred)
-    b = -a * xy / yy
-    d = wp.sqrt(HALF_LOG2_E / yy)
-    box_x = wp.sqrt(reach * xx / HALF_LOG2_E) * SLACK
-    box_y = wp.sqrt(reach * yy / HALF_LOG2_E) * SLACK
-    # A sum of magnitudes is finite only where all its terms are.
-    if not (wp.isfinite(wp.abs(mean_x) + wp.abs(mean_y) + a + wp.abs(b) + d + box_x + box_y + reach + det_blurred)):
-        return
-    if box_x <= radius_clip and box_y <= radius_clip:
-        return
+    d = SQRT_HALF_LOG2_E / deviation_y
+    a = deviation_y * SQRT_HALF_LOG2_E / wp.sqrt(det_blurred)
+    b = -a * xy / (yy + eps2d)
+    box_x = extent * deviation_x * (SLACK / SQRT_HALF_LOG2_E)
+    box_y = extent * deviation_y * (SLACK / SQRT_HALF_LOG2_E)
 
     # Pixels whose centre lies in the box, then the tiles they lie in (end exclusive).
     x0 = wp.max(wp.ceil(mean_x - box_x - 0.5), 0.0)
     y0 = wp.max(wp.ceil(mean_y - box_y - 0.5), 0.0)
     x1 = wp.min(wp.floor(mean_x + box_x - 0.5), float(width - 1))
     y1 = wp.min(wp.floor(mean_y + box_y - 0.5), float(height - 1))
-    if x0 > x1 or y0 > y1:
+    # A sum of magnitudes is finite only where all its terms are.
+    size = wp.abs(mean_x) + wp.abs(mean_y) + a + wp.abs(b) + d + box_x + box_y + extent2 + det_blurred
+    drawn = extent2 >= 0.0 and wp.isfinite(size) and x0 <= x1 and y0 <= y1
+    if not drawn or (box_x <= radius_clip and box_y <= radius_clip):
+        clear(i, records_out, radii_out, rects_out)
         return
 
     block = 1.5 * wp.sqrt((a + wp.abs(b)) * (a + wp.abs(b)) + d * d)
-    distance = (wp.sqrt(reach) + block) * SLACK
+    reach = (extent + block) * SLACK
     records_out[i, MEAN] = mean_x
     records_out[i, MEAN + 1] = mean_y
     records_out[i, FACTOR] = a
@@ -198,30 +206,16 @@ def project(
     records_out[i, DEPTH] = z
     records_out[i, BOX] = box_x
     records_out[i, BOX + 1] = box_y
-    records_out[i, REACH] = distance * distance
+    records_out[i, REACH] = reach * reach
     records_out[i, COMPENSATION] = compensation
     radii_out[i] = wp.vec2i(int(wp.min(wp.ceil(box_x), 1.0e9)), int(wp.min(wp.ceil(box_y), 1.0e9)))
-    rects_out[i] = wp.vec4i(
-        int(x0) / TILE,
-        int(y0) / TILE,
-        int(x1) / TILE + 1,
-        int(y1) / TILE + 1,
+    rects_out[i] = vec4s(
+        wp.int16(int(x0) / TILE),
+        wp.int16(int(y0) / TILE),
+        wp.int16(int(x1) / TILE + 1),
+        wp.int16(int(y1) / TILE + 1),
     )
     keys_out[camera, n] = z
-
-
-@wp.func
-def visible(rect: wp.vec4i) -> bool:
-    return rect[2] > 0
-
-
-@wp.func
-def cull(i: int, records_out: wp.array2d[float], radii_out: wp.array[wp.vec2i], rects_out: wp.array[wp.vec4i]):
-    """Turn a record already written into that of a culled Gaussian."""
-    for j in range(RECORD):
-        records_out[i, j] = 0.0
-    radii_out[i] = wp.vec2i(0, 0)
-    rects_out[i] = wp.vec4i(0, 0, 0, 0)
 
 
 @wp.kernel
@@ -235,9 +229,9 @@ def shade_harmonics(
     # Out:
     records_out: wp.array2d[float],
     radii_out: wp.array[wp.vec2i],
-    rects_out: wp.array[wp.vec4i],
+    rects_out: wp.array[vec4s],
 ):
-    """Channels = max(0, SH(direction from the camera) + 0.5), depth. Culls Gaussians whose colour is not finite."""
+    """Channels = max(0, SH(direction from the camera) + 0.5), depth. Culls where the colour is not finite."""
     i = start + wp.tid()
     if not visible(rects_out[i]):
         return
@@ -248,7 +242,7 @@ def shade_harmonics(
     direction = wp.normalize(wp.transpose(view_rotation(viewmats[camera])) * p)
     rgb = harmonics_sum(sh, n, degree, direction) + wp.vec3(0.5, 0.5, 0.5)
     if not (wp.isfinite(rgb)):
-        cull(i, records_out, radii_out, rects_out)
+        clear(i, records_out, radii_out, rects_out)
         return
     for j in range(3):
         records_out[i, CHANNELS + j] = wp.max(rgb[j], 0.0)
@@ -263,9 +257,9 @@ def shade_features(
     # Out:
     records_out: wp.array2d[float],
     radii_out: wp.array[wp.vec2i],
-    rects_out: wp.array[wp.vec4i],
+    rects_out: wp.array[vec4s],
 ):
-    """Channels = the first four of features and depth; row i % rows. Culls where any feature is not finite."""
+    """Channels = the first four of features and depth, row i % rows. Culls where a feature is not finite."""
     i = start + wp.tid()
     if not visible(rects_out[i]):
         return
@@ -273,7 +267,7 @@ def shade_features(
     for j in range(features.shape[1]):
         value = features[row, j]
         if not (wp.isfinite(value)):
-            cull(i, records_out, radii_out, rects_out)
+            clear(i, records_out, radii_out, rects_out)
             return
         if j < 4:
             records_out[i, CHANNELS + j] = value
@@ -287,7 +281,7 @@ def pack_channels(
     # In:
     features: wp.array2d[float],
     records: wp.array2d[float],
-    rects: wp.array[wp.vec4i],
+    rects: wp.array[vec4s],
     first: int,
     # Out:
     channels_out: wp.array2d[float],
@@ -296,7 +290,7 @@ def pack_channels(
     i = start + wp.tid()
     row = i % features.shape[0]
     for j in range(4):
-        value = float(0.0)
+        value = wp.float32(0.0)
         if visible(rects[i]):
             if first + j < features.shape[1]:
                 value = features[row, first + j]

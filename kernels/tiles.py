@@ -10,6 +10,7 @@ Tiles are numbered row by row, camera after camera.
 """
 
 import warp as wp
+from gdpro_sim.kernels.projection import vec4s
 
 wp.set_module_options(
     {
@@ -22,10 +23,13 @@ wp.set_module_options(
 
 
 @wp.func
-def sorted_gaussian(order: wp.array2d[int], count: int, i: int) -> int:
-    """Record number of the i-th Gaussian in depth order, camera after camera, `count` in each."""
-    camera = i / count
-    return order[camera, i - camera * count]
+def area(rect: vec4s) -> int:
+    return (int(rect[2]) - int(rect[0])) * (int(rect[3]) - int(rect[1]))
+
+
+@wp.func
+def first_tile(rect: vec4s, camera: int, tiles_x: int, tiles_y: int) -> int:
+    return (camera * tiles_y + int(rect[1])) * tiles_x + int(rect[0])
 
 
 @wp.kernel
@@ -33,8 +37,7 @@ def count_tiles(
     start: int,
     # In:
     order: wp.array2d[int],
-    rects: wp.array[wp.vec4i],
-    count: int,
+    rects: wp.array[vec4s],
     parts: int,
     tiles_x: int,
     tiles_y: int,
@@ -43,16 +46,20 @@ def count_tiles(
 ):
     """Part p of the Gaussians: how many touch each tile. `counts_out` [parts, tiles] starts at zero."""
     part = start + wp.tid()
-    total = wp.int64(rects.shape[0])
-    begin = int(total * wp.int64(part) / wp.int64(parts))
-    end = int(total * wp.int64(part + 1) / wp.int64(parts))
-    for i in range(begin, end):
-        g = sorted_gaussian(order, count, i)
-        rect = rects[g]
-        for y in range(rect[1], rect[3]):
-            row = (g / count * tiles_y + y) * tiles_x
-            for x in range(rect[0], rect[2]):
-                counts_out[part, row + x] = counts_out[part, row + x] + 1
+    begin = int(wp.int64(order.shape[1] / 2) * wp.int64(part) / wp.int64(parts))
+    end = int(wp.int64(order.shape[1] / 2) * wp.int64(part + 1) / wp.int64(parts))
+    for camera in range(order.shape[0]):
+        for i in range(begin, end):
+            g = order[camera, i]
+            rect = rects[g]
+            tile = first_tile(rect, camera, tiles_x, tiles_y)
+            right = tile + int(rect[2]) - int(rect[0])
+            for _j in range(area(rect)):
+                counts_out[part, tile] = counts_out[part, tile] + 1
+                tile += 1
+                if tile == right:
+                    tile += tiles_x - (int(rect[2]) - int(rect[0]))
+                    right += tiles_x
 
 
 @wp.kernel
@@ -80,8 +87,7 @@ def fill_tiles(
     start: int,
     # In:
     order: wp.array2d[int],
-    rects: wp.array[wp.vec4i],
-    count: int,
+    rects: wp.array[vec4s],
     parts: int,
     tiles_x: int,
     tiles_y: int,
@@ -91,18 +97,22 @@ def fill_tiles(
 ):
     """Part p of the Gaussians: write each into the lists of its tiles, from `next_out` [parts, tiles] on."""
     part = start + wp.tid()
-    total = wp.int64(rects.shape[0])
-    begin = int(total * wp.int64(part) / wp.int64(parts))
-    end = int(total * wp.int64(part + 1) / wp.int64(parts))
-    for i in range(begin, end):
-        g = sorted_gaussian(order, count, i)
-        rect = rects[g]
-        for y in range(rect[1], rect[3]):
-            row = (g / count * tiles_y + y) * tiles_x
-            for x in range(rect[0], rect[2]):
-                at = next_out[part, row + x]
+    begin = int(wp.int64(order.shape[1] / 2) * wp.int64(part) / wp.int64(parts))
+    end = int(wp.int64(order.shape[1] / 2) * wp.int64(part + 1) / wp.int64(parts))
+    for camera in range(order.shape[0]):
+        for i in range(begin, end):
+            g = order[camera, i]
+            rect = rects[g]
+            tile = first_tile(rect, camera, tiles_x, tiles_y)
+            right = tile + int(rect[2]) - int(rect[0])
+            for _j in range(area(rect)):
+                at = next_out[part, tile]
                 ids_out[at] = g
-                next_out[part, row + x] = at + 1
+                next_out[part, tile] = at + 1
+                tile += 1
+                if tile == right:
+                    tile += tiles_x - (int(rect[2]) - int(rect[0]))
+                    right += tiles_x
 
 
 @wp.kernel
@@ -110,15 +120,15 @@ def count_expansion(
     start: int,
     # In:
     order: wp.array2d[int],
-    rects: wp.array[wp.vec4i],
+    rects: wp.array[vec4s],
     count: int,
     # Out:
     counts_out: wp.array[int],
 ):
     """How many tiles the i-th Gaussian in depth order touches."""
     i = start + wp.tid()
-    rect = rects[sorted_gaussian(order, count, i)]
-    counts_out[i] = (rect[2] - rect[0]) * (rect[3] - rect[1])
+    camera = i / count
+    counts_out[i] = area(rects[order[camera, i - camera * count]])
 
 
 @wp.kernel
@@ -126,7 +136,7 @@ def expand_tiles(
     start: int,
     # In:
     order: wp.array2d[int],
-    rects: wp.array[wp.vec4i],
+    rects: wp.array[vec4s],
     count: int,
     begins: wp.array[int],
     tiles_x: int,
@@ -137,12 +147,13 @@ def expand_tiles(
 ):
     """Write (tile, Gaussian) for each tile of the i-th Gaussian in depth order, from `begins[i]` on."""
     i = start + wp.tid()
-    g = sorted_gaussian(order, count, i)
+    camera = i / count
+    g = order[camera, i - camera * count]
     rect = rects[g]
     at = begins[i]
-    for y in range(rect[1], rect[3]):
-        row = (g / count * tiles_y + y) * tiles_x
-        for x in range(rect[0], rect[2]):
+    for y in range(int(rect[1]), int(rect[3])):
+        row = (camera * tiles_y + y) * tiles_x
+        for x in range(int(rect[0]), int(rect[2])):
             tiles_out[at] = row + x
             ids_out[at] = g
             at += 1
@@ -159,7 +170,7 @@ def find_tiles(
 ):
     """Where each tile's group begins in the sorted `tiles`; index runs over entries + 1 boundaries."""
     i = start + wp.tid()
-    before = int(-1)
+    before = wp.int32(-1)
     if i > 0:
         before = tiles[i - 1]
     here = offsets_out.shape[0] - 1

@@ -46,7 +46,7 @@ def composite(
 ) -> Composite:
     """Blend D channels over `backgrounds` [C, D]; channel `divided` is divided by alpha instead (-1: none).
 
-    The first four channels are those of the records; later ones come from `features` [N or C N, D'], then depth.
+    The first four channels are those of the records; later ones from `features` [N or C N, F], then depth.
     `tile` chooses the CPU kernel (one index per tile), else one index per pixel.
     """
     cameras, channels = backgrounds.shape
@@ -99,7 +99,7 @@ def composite(
 
 
 def _launch_balanced(offsets: torch.Tensor, arguments: list[object]) -> None:
-    """One launch per thread over runs of tiles with about equal numbers of entries (an empty tile counts 32)."""
+    """One launch per thread, over runs of tiles with about equally many entries (an empty tile counts 32)."""
     tiles = len(offsets) - 1
     threads = thread_count()
     if threads == 1:

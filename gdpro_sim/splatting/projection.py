@@ -1,14 +1,16 @@
-"""First stage: Gaussians in space -> records of 2D Gaussians with colours, one for each camera and Gaussian."""
+"""First stage: Gaussians in space -> records of coloured 2D Gaussians, one for each camera and Gaussian."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
 
 from gdpro_sim.device import launch_chunked
 from gdpro_sim.kernels import projection as kernels
+from gdpro_sim.kernels.projection import vec4s
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Projection:
 
     records: [M, 16] float32, see `gdpro_sim.kernels.projection`; zeros where culled
     radii:   [M, 2] int32, half extents in pixels of the box outside which alpha < 1/255; zeros where culled
-    rects:   [M, 4] int32, tiles touched: x begin, y begin, x end, y end (exclusive); zeros where culled
+    rects:   [M, 4] int16, tiles touched: x begin, y begin, x end, y end (exclusive); zeros where culled
     order:   [C, 2 N] int32, of which order[:, :N] are record numbers in ascending depth, culled ones last
     """
 
@@ -74,7 +76,7 @@ class Projection:
         return torch.stack([a * a, a * b, b * b + d * d], dim=-1) / kernels.HALF_LOG2_E
 
 
-def array(tensor: torch.Tensor, dtype: type) -> wp.array:
+def array(tensor: torch.Tensor, dtype: type) -> Any:
     """The tensor's memory as a Warp array; trailing axes become vectors or matrices where `dtype` is one."""
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
 
@@ -88,13 +90,13 @@ def device_name(tensor: torch.Tensor) -> str:
 def project(
     means: torch.Tensor, quats: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, view: View
 ) -> Projection:
-    """Project N >= 1 Gaussians into C >= 1 cameras and sort each camera's by depth; channels are not set yet."""
+    """Project N >= 1 Gaussians into C >= 1 cameras and sort each camera's by depth; leaves out channels."""
     cameras, count = len(view.viewmats), len(means)
     total = cameras * count
     device = device_name(means)
     records = means.new_empty((total, int(kernels.RECORD)))
     radii = means.new_empty((total, 2), dtype=torch.int32)
-    rects = means.new_empty((total, 4), dtype=torch.int32)
+    rects = means.new_empty((total, 4), dtype=torch.int16)
     keys = means.new_empty((cameras, 2 * count))
     order = means.new_empty((cameras, 2 * count), dtype=torch.int32)
     launch_chunked(
@@ -118,7 +120,7 @@ def project(
         [
             array(records, wp.float32),
             array(radii, wp.vec2i),
-            array(rects, wp.vec4i),
+            array(rects, vec4s),
             array(keys, wp.float32),
             array(order, wp.int32),
         ],
@@ -143,7 +145,7 @@ def shade_harmonics(
 
 
 def shade_features(projection: Projection, features: torch.Tensor) -> None:
-    """Set the first four of (features [N or C N, D], depth) as channels; cull where a feature is not finite."""
+    """Set the first four of (features [N or C N, D], depth) as channels; cull what is not finite."""
     launch_chunked(
         kernels.shade_features,
         len(projection.records),
@@ -162,7 +164,7 @@ def pack_channels(projection: Projection, features: torch.Tensor, first: int) ->
         [
             array(features, wp.float32),
             array(projection.records, wp.float32),
-            array(projection.rects, wp.vec4i),
+            array(projection.rects, vec4s),
             first,
         ],
         [array(channels, wp.float32)],
@@ -171,11 +173,11 @@ def pack_channels(projection: Projection, features: torch.Tensor, first: int) ->
     return channels
 
 
-def _culled(projection: Projection) -> list[wp.array]:
+def _culled(projection: Projection) -> list[Any]:
     return [
         array(projection.records, wp.float32),
         array(projection.radii, wp.vec2i),
-        array(projection.rects, wp.vec4i),
+        array(projection.rects, vec4s),
     ]
 
 

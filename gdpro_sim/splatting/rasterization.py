@@ -17,7 +17,7 @@ from gdpro_sim.splatting.checks import (
 )
 from gdpro_sim.splatting.compositing import Composite, composite
 from gdpro_sim.splatting.projection import Projection, View, project, shade_features, shade_harmonics
-from gdpro_sim.splatting.tiles import bin_tiles, count_and_fill, empty_lists, expand_and_sort
+from gdpro_sim.splatting.tiles import count_and_fill, empty_lists, expand_and_sort
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -28,10 +28,10 @@ METHODS = ("auto", "tile", "pixel")
 class RasterOptions:
     """Rarely needed settings of `rasterization`.
 
-    method:           "tile" (CPU only: vectorised over a tile), "pixel" (one index per pixel, what a GPU runs; on
-                      a CPU slow, for comparison) or "auto", the one made for the device
-    max_tile_entries: most (tile, Gaussian) pairs to make; more raise RequestError before memory is taken (4 bytes
-                      each on a CPU, 16 on a GPU)
+    method:           "tile" (CPU only: vectorised over a tile), "pixel" (one index per pixel, what a GPU
+                      runs; on a CPU slow, for comparison) or "auto", the one made for the device
+    max_tile_entries: most (tile, Gaussian) pairs to make; more raise RequestError before memory is taken
+                      (4 bytes each on a CPU, 16 on a GPU)
     """
 
     method: str = "auto"
@@ -42,7 +42,8 @@ class RasterOptions:
         entries = self.max_tile_entries
         if isinstance(entries, bool) or not isinstance(entries, int) or not 0 <= entries <= INDEX_LIMIT:
             raise ValueError(
-                f"RasterOptions.max_tile_entries must be a whole number from 0 to {INDEX_LIMIT}, got {entries!r}"
+                "RasterOptions.max_tile_entries must be a whole number "
+                f"from 0 to {INDEX_LIMIT}, got {entries!r}"
             )
 
 
@@ -77,9 +78,9 @@ def rasterization(
     quats      [N, 4] wxyz, any length but zero
     scales     [N, 3] metres, standard deviations along the rotated axes
     opacities  [N] in [0, 1]
-    colors     [N, K, 3] spherical-harmonics coefficients, K >= (sh_degree + 1)^2, where `sh_degree` (0-3) is given:
-               colour = max(0, SH(direction) + 0.5). Else [N, D] or [C, N, D] features of any D >= 1, blended as
-               they are. Not used in modes "D" and "ED"
+    colors     [N, K, 3] spherical-harmonics coefficients, K >= (sh_degree + 1)^2, where `sh_degree` (0-3) is
+               given: colour = max(0, SH(direction) + 0.5). Else [N, D] or [C, N, D] features of any D >= 1,
+               blended as they are. Not used in modes "D" and "ED"
     viewmats   [C, 4, 4] rigid, world to camera, OpenCV axes (+z forward, +y down)
     Ks         [C, 3, 3] pixels; pixel centres lie at +0.5
     width, height  image size in pixels
@@ -94,16 +95,16 @@ def rasterization(
     Returns colours [C, H, W, D], alphas [C, H, W, 1] and a dict with
         width, height, tile_size, tile_width, tile_height, n_cameras  numbers
         means2d [C, N, 2], depths [C, N], opacities [C, N], radii [C, N, 2] (pixels; zero where not drawn)
-        isect_offsets [C, tile_height, tile_width], flatten_ids [E]   tile lists: Gaussian c N + n, front to back
-        transmittance [C, H, W]                                       what reaches the background
-        projection, tile_lists, composite                             the stages' own results
+        isect_offsets [C, tile_height, tile_width], flatten_ids [E]  tile lists: Gaussian c N + n, by depth
+        transmittance [C, H, W]                                      what reaches the background
+        projection, tile_lists, composite                            the stages' own results
 
     A Gaussian is not drawn where its parameters or colour hold NaN or infinity, or its quaternion is zero.
-    Raises ValueError where an argument is malformed or requires grad, and RequestError where counts do not fit
-    32-bit indices.
+    Raises ValueError where an argument is malformed or requires grad, and RequestError where counts do not
+    fit 32-bit indices.
 
-    Source: Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023); projection from
-    Zwicker et al., "EWA Splatting" (2002); antialiasing from Yu et al., "Mip-Splatting" (2024), eq. 9.
+    Source: Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023); projection
+    from Zwicker et al., "EWA Splatting" (2002); antialiasing from Yu et al., "Mip-Splatting" (2024), eq. 9.
     """
     options = RasterOptions() if options is None else options
     means = check_tensor("means", means, ("N", 3))
@@ -140,6 +141,7 @@ def rasterization(
     columns, rows = view.tiles
     check_count("Gaussians times cameras", cameras * count)
     check_count("image values (cameras x height x width x channels)", cameras * height * width * channels)
+    check_count("image columns or rows", max(width, height), 16 * 32767)
     check_count("pixels of all tiles", cameras * rows * columns * 256)
 
     tile = options.method == "tile" or (options.method == "auto" and means.device.type == "cpu")
@@ -213,7 +215,7 @@ def _nothing(cameras: int, count: int, means: torch.Tensor) -> Projection:
     return Projection(
         means.new_zeros((total, 16)),
         means.new_zeros((total, 2), dtype=torch.int32),
-        means.new_zeros((total, 4), dtype=torch.int32),
+        means.new_zeros((total, 4), dtype=torch.int16),
         means.new_zeros((cameras, 2 * count), dtype=torch.int32),
         cameras,
         count,

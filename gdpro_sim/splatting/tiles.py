@@ -9,6 +9,7 @@ import warp as wp
 
 from gdpro_sim.device import launch_chunked, thread_count
 from gdpro_sim.kernels import tiles as kernels
+from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting.checks import INDEX_LIMIT, check_count
 from gdpro_sim.splatting.projection import Projection, View, array, device_name
 
@@ -47,14 +48,13 @@ def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT)
     """Counting sort, for CPUs. The lists do not depend on the number of threads."""
     columns, rows = view.tiles
     tiles = projection.cameras * rows * columns
-    total = len(projection.records)
-    parts = max(1, min(thread_count(), total // PART))
-    rects = array(projection.rects, wp.vec4i)
+    parts = max(1, min(thread_count(), projection.gaussians // PART))
+    rects = array(projection.rects, vec4s)
     order = array(projection.order, wp.int32)
     counts = torch.zeros((parts, tiles), dtype=torch.int32)
     offsets = torch.empty(tiles + 1, dtype=torch.int32)
     entries = torch.empty(1, dtype=torch.int64)
-    inputs = [order, rects, projection.gaussians, parts, columns, rows]
+    inputs = [order, rects, parts, columns, rows]
     counts_array = array(counts, wp.int32)
     launch_chunked(kernels.count_tiles, parts, inputs, [counts_array], device="cpu", minimum=1)
     outputs = [counts_array, array(offsets, wp.int32), array(entries, wp.int64)]
@@ -72,7 +72,7 @@ def expand_and_sort(projection: Projection, view: View, limit: int = INDEX_LIMIT
     total = len(projection.records)
     device = projection.records.device
     name = device_name(projection.records)
-    rects = array(projection.rects, wp.vec4i)
+    rects = array(projection.rects, vec4s)
     order = array(projection.order, wp.int32)
     counts = torch.empty(total, dtype=torch.int32, device=device)
     inputs = [order, rects, projection.gaussians]
