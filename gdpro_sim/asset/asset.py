@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import math
@@ -83,10 +84,11 @@ class Asset:
         """
         layer = stage.open_layer(path)
         usd_stage, root = stage.open_root(layer, path, "asset")
-        try:
-            return _read(usd_stage, root)
-        except AssetError as error:
-            raise AssetError(f"{path}: {error}") from error
+        with stage.reading(path):
+            asset = _read(usd_stage, root)
+            if root.GetAttribute("gdpro:digest").Get() != _digest(asset):
+                log.warning("%s differs from what was saved: it was edited, or it is damaged", path)
+            return asset
 
     def scaled(self, factor: float) -> Asset:
         """The asset resized uniformly by `factor` > 0: mesh, Gaussians and tets. Raises AssetError."""
@@ -203,11 +205,28 @@ def _check_embedding(asset: str, embedding: Embedding, vertex_count: int, tet_co
 # ---- file ----
 
 
+def _digest(asset: Asset) -> str:
+    """SHA-256 of everything an asset holds, so that a damaged file is noticed."""
+    material = asset.material.model_dump_json() if asset.material is not None else ""
+    method = asset.tets.method if asset.tets is not None else ""
+    result = hashlib.sha256(json.dumps([asset.name, asset.provenance, material, method]).encode())
+    arrays = [prims.to_numpy(getattr(asset.gaussians, f.name)) for f in fields(asset.gaussians)]
+    if asset.vertex_colors is not None:
+        arrays.append(asset.vertex_colors)
+    if asset.tets is not None and asset.embedding is not None:
+        arrays += [asset.tets.vertices, asset.tets.tets, asset.tets.fill]
+        arrays += [asset.embedding.tet_ids, asset.embedding.weights]
+    for array in arrays:
+        result.update(np.ascontiguousarray(array).data)
+    return result.hexdigest()
+
+
 def _author(layer: Sdf.Layer, asset: Asset) -> None:
     usd_stage = stage.new_stage(layer, "Asset", "asset")
     root = usd_stage.GetDefaultPrim()
     stage.set_custom(root, "gdpro:name", prims.T.String, asset.name)
     stage.set_custom(root, "gdpro:provenance", prims.T.String, json.dumps(asset.provenance))
+    stage.set_custom(root, "gdpro:digest", prims.T.String, _digest(asset))
     parent = root.GetPath()
     bound = asset.gaussians
     rest = bound.gaussians()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -137,12 +139,24 @@ def open_layer(path: str | Path, *, lazy: bool = False) -> Sdf.Layer:
     return layer
 
 
+@contextlib.contextmanager
+def reading(place: str | Path) -> Iterator[None]:
+    """Put `place` in front of an AssetError, and make one of what USD raises on a damaged array."""
+    try:
+        yield
+    except AssetError as error:
+        raise AssetError(f"{place}: {error}") from error
+    except Tf.ErrorException as error:
+        raise AssetError(f"{place} is damaged: {usd_message(error)}") from error
+
+
 def open_root(layer: Sdf.Layer, path: str | Path, kind: FileKind) -> tuple[Usd.Stage, Usd.Prim]:
     """The stage and root prim of one of our files, checked for its kind and version.
 
     Raises AssetError where the file is something else or newer than this package.
     """
-    found, version = _signature(layer)
+    with reading(path):
+        found, version = _signature(layer)
     if found != kind:
         what = f"it holds {'an' if found == 'asset' else 'a'} {found}" if found else "it has no `gdpro:kind`"
         hint = "; make one of a mesh with `gdpro import`" if kind == "asset" and not found else ""
@@ -152,8 +166,9 @@ def open_root(layer: Sdf.Layer, path: str | Path, kind: FileKind) -> tuple[Usd.S
             f"{path} has format version {version}, this package reads version {FORMAT_VERSION}; "
             "upgrade gdpro-sim or write the file again"
         )
-    stage = Usd.Stage.Open(layer)
-    return stage, stage.GetDefaultPrim()
+    with reading(path):
+        stage = Usd.Stage.Open(layer)
+        return stage, stage.GetDefaultPrim()
 
 
 def _signature(layer: Sdf.Layer) -> tuple[str | None, int | None]:
@@ -178,13 +193,14 @@ def kind(path: str | Path) -> FileKind:
     if suffix not in USD_SUFFIXES:
         return "unknown"
     layer = open_layer(file, lazy=True)
-    found, _ = _signature(layer)
-    if found == "asset":
-        return "asset"
-    if found == "simulation":
-        return "simulation"
-    stage = Usd.Stage.Open(layer, Usd.Stage.LoadAll)
-    return "mesh" if any(prim.IsA(UsdGeom.Mesh) for prim in stage.Traverse()) else "unknown"
+    with reading(path):
+        found, _ = _signature(layer)
+        if found == "asset":
+            return "asset"
+        if found == "simulation":
+            return "simulation"
+        stage = Usd.Stage.Open(layer, Usd.Stage.LoadAll)
+        return "mesh" if any(prim.IsA(UsdGeom.Mesh) for prim in stage.Traverse()) else "unknown"
 
 
 def is_asset(path: str | Path) -> bool:
@@ -204,6 +220,7 @@ __all__ = [
     "open_layer",
     "open_root",
     "pack",
+    "reading",
     "set_custom",
     "usd_message",
 ]

@@ -381,18 +381,19 @@ class SimulationReader:
         self.path = Path(path)
         layer = stage.open_layer(path, lazy=True)
         self._stage, self._root = stage.open_root(layer, path, "simulation")
-        self.fps = float(self._stage.GetTimeCodesPerSecond())
-        self._codes = [float(t) for t in self._root.GetAttribute("gdpro:time").GetTimeSamples()]
-        self.times = [float(self._root.GetAttribute("gdpro:time").Get(t)) for t in self._codes]
-        self.precision = str(self._root.GetAttribute("gdpro:precision").Get())
-        try:
-            self.metadata: dict[str, Any] = json.loads(
-                self._root.GetAttribute("gdpro:metadata").Get() or "{}"
-            )
+        with stage.reading(path):
+            times = self._root.GetAttribute("gdpro:time")
+            self.fps = float(self._stage.GetTimeCodesPerSecond())
+            self._codes = [float(code) for code in times.GetTimeSamples()]
+            self.times = [float(times.Get(code)) for code in self._codes]
+            self.precision = str(self._root.GetAttribute("gdpro:precision").Get())
+            try:
+                metadata = json.loads(self._root.GetAttribute("gdpro:metadata").Get() or "{}")
+            except ValueError as error:
+                raise AssetError(f"gdpro:metadata is not JSON: {error}") from error
+            self.metadata: dict[str, Any] = metadata
             self._paths = [Sdf.Path(p) for p in self._root.GetAttribute("gdpro:bodies").Get() or []]
             self.bodies = tuple(self._body(p) for p in self._paths)
-        except (AssetError, ValueError) as error:
-            raise AssetError(f"{path}: {error}") from error
 
     def __len__(self) -> int:
         return len(self._codes)
@@ -412,7 +413,7 @@ class SimulationReader:
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path} has frames 0-{len(self) - 1}, got {index}")
         code = self._codes[index]
-        try:
+        with stage.reading(f"{self.path}, frame {index}"):
             bodies = tuple(
                 BodyFrame(body.name, self._vertices(p, code), self._gaussians(p, code))
                 for body, p in zip(self.bodies, self._paths, strict=True)
@@ -423,8 +424,6 @@ class SimulationReader:
                 if value is None:
                     raise AssetError(f"{_FIGURES}{figure.name} is missing")
                 figures[figure.name] = _FIGURE_TYPES[str(figure.type)][2](value)
-        except AssetError as error:
-            raise AssetError(f"{self.path}, frame {index}: {error}") from error
         return Frame(int(code), self.times[index], bodies, Diagnostics(**figures))
 
     def _vertices(self, path: Sdf.Path, code: float) -> np.ndarray:

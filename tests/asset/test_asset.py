@@ -286,6 +286,31 @@ def test_wrong_sizes_and_newer_versions_are_refused(tmp_path: Path) -> None:
         Asset.load(path)
 
 
+def test_damaged_bytes_are_an_error_or_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Blanked blocks anywhere in the file: never a silent change, never a foreign exception."""
+    path = tmp_path / "a.usdc"
+    asset = make_asset(400)
+    asset.save(path)
+    assert_same(asset, Asset.load(path))
+    assert not caplog.records
+    data = path.read_bytes()
+    refused = 0
+    for start in range(0, len(data) - 300, 997):
+        path.write_bytes(
+            data[:start] + bytes(b ^ 0x55 for b in data[start : start + 300]) + data[start + 300 :]
+        )
+        caplog.clear()
+        try:
+            found = Asset.load(path)
+        except AssetError as error:
+            refused += 1
+            assert "a.usdc" in str(error)
+            continue
+        if not caplog.records:
+            assert_same(asset, found)
+    assert refused > 3
+
+
 # ---- files that cannot be written ----
 
 
