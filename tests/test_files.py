@@ -1,0 +1,61 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from gdpro_sim.errors import OutputError, RequestError
+from gdpro_sim.files import atomic_write, check_writable, sha256_of
+
+
+def test_the_file_appears_at_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with atomic_write(path) as temporary:
+        temporary.write_text("new")
+        assert temporary.parent == tmp_path and temporary.suffix == ".txt"
+        assert not path.exists()
+    assert path.read_text() == "new" and os.listdir(tmp_path) == ["a.txt"]
+    assert sha256_of(path) == hashlib.sha256(b"new").hexdigest()
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_error_leaves_what_was_there(tmp_path: Path, error: type[BaseException]) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(error), atomic_write(path) as temporary:
+        temporary.write_text("half")
+        raise error
+    assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_a_full_disk_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    with pytest.raises(OutputError, match=r"a\.txt: no space left"), atomic_write(path) as temporary:
+        temporary.write_text("half")
+        raise OSError(28, "No space left on device")
+    assert os.listdir(tmp_path) == []
+
+
+def test_links_are_followed_and_stay_links(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "real" / "a.txt").write_text("old")
+    link = tmp_path / "link.txt"
+    link.symlink_to(tmp_path / "real" / "a.txt")
+    with atomic_write(link) as temporary:
+        temporary.write_text("new")
+    assert link.is_symlink() and (tmp_path / "real" / "a.txt").read_text() == "new"
+
+
+def test_only_regular_files_are_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path, message in (
+        (tmp_path / "pipe", "not a regular file"),
+        (tmp_path, "it is a folder"),
+        (tmp_path / "absent" / "a", "does not exist"),
+    ):
+        with pytest.raises(RequestError, match=message):
+            check_writable(path)
