@@ -125,12 +125,12 @@ class BoundGaussians:
 
 def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
     """Area-weighted unit vertex normals, [V, 3]; zero where a vertex has no area around it."""
-    corners = vertices[faces.long()]
+    corners = vertices.double()[faces.long()]
     face = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = torch.zeros_like(vertices)
-    for k in range(3):
-        total.index_add_(0, faces[:, k].long(), face)
-    return torch.nn.functional.normalize(total, dim=1)
+    where = faces.long().T.reshape(-1)
+    # bincount adds up about ten times faster than index_add_ on a CPU
+    total = [torch.bincount(where, face[:, k].repeat(3), len(vertices)) for k in range(3)]
+    return torch.nn.functional.normalize(torch.stack(total, 1), dim=1, eps=1e-300).to(vertices.dtype)
 
 
 @functools.cache

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import hashlib
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
@@ -50,6 +51,13 @@ def prepare_folder(folder: str | Path, file: str) -> Path:
 def temporary_beside(target: Path) -> Path:
     """A fresh hidden name in the folder of `target`, with its suffix (writers pick the format by suffix)."""
     return target.with_name(f".{target.stem}.{secrets.token_hex(6)}.tmp{target.suffix}")
+
+
+def remove_stale(folder: str | Path) -> None:
+    """Delete what killed processes left in `folder` under temporary names; no other may be writing there."""
+    for path in Path(folder).glob(".*.tmp.*"):
+        if re.fullmatch(r"\..*\.[0-9a-f]{12}\.tmp\..*", path.name):
+            remove_quietly(path)
 
 
 def commit_file(temporary: Path, target: Path) -> None:
@@ -118,6 +126,7 @@ __all__ = [
     "output_error",
     "prepare_folder",
     "remove_quietly",
+    "remove_stale",
     "sha256_of",
     "temporary_beside",
 ]

@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from gdpro_sim.cli import main
+
 SCENE = """
 bodies:
   - asset: ball.obj
@@ -107,12 +109,22 @@ def test_info_render_and_scenes(folder: Path) -> None:
         (["info", "scene.yaml"], "scene.yaml"),
     ],
 )
-def test_wrong_requests_exit_2_with_one_line(folder: Path, arguments: list[str], expected: str) -> None:
-    done = gdpro(*arguments, cwd=folder, ok=False)
-    assert done.returncode == 2, done.stderr
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("gdpro: "), done.stderr
-    assert expected in done.stderr
+def test_wrong_requests_exit_2_with_one_line(
+    folder: Path,
+    arguments: list[str],
+    expected: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["gdpro", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    errors = capsys.readouterr().err
+    lines = errors.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("gdpro: "), errors
+    assert expected in errors
     assert not (folder / "x.usdc").exists()
 
 

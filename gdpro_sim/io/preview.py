@@ -14,9 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import warp as wp
 
 from gdpro_sim.cameras import Cameras
+from gdpro_sim.device import launch_chunked
 from gdpro_sim.gaussians import SH_C0, Gaussians
+from gdpro_sim.kernels.shading import gather_light
 from gdpro_sim.splatting import rasterization
 
 GAMMA = 2.2
@@ -25,6 +28,7 @@ FLOOR_SIZE = 224
 KEY_SHARE = 0.66
 BOUNCE = 0.10
 GLOSS = 0.16
+KEY_LIGHTS = 6
 
 
 @dataclass(frozen=True)
@@ -35,19 +39,22 @@ class Studio:
     background: "studio" (gradient and gridded floor), "white" or "black"
     ground:     height of the floor in m, or None for no floor
     scale:      size of the subject in m; sets the grid spacing and where the floor fades out
+    focus:      m; the floor fades out around it, and the key light stands beside the camera that sees it
     """
 
     shading: str = "studio"
     background: str = "studio"
     ground: float | None = 0.0
     scale: float = 1.0
+    focus: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @functools.cache
 def _lights(azimuth: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions towards the lights [L, 3] and their weights [L]; the key light stands beside the camera.
+    """Directions towards the lights [L, 3] and their weights [L]; the key light's copies come first.
 
-    A horizontal surface in full light receives 1.
+    azimuth: degrees, where the camera stands; the key light stands to its left. A horizontal surface in full
+    light receives 1.
     """
     directions: list[tuple[float, float, float]] = []
     weights: list[float] = []
@@ -57,8 +64,9 @@ def _lights(azimuth: int) -> tuple[np.ndarray, np.ndarray]:
         directions.append((math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)))
         weights.append(weight / math.sin(e))
 
-    for turn, lift in ((-5.0, -3.0), (5.0, -4.0), (-4.0, 4.0), (4.0, 5.0)):
-        add(azimuth - 48.0 + turn, 47.0 + lift, KEY_SHARE / 4.0)
+    for k in range(KEY_LIGHTS):  # a disc of light, sampled in a spiral (Vogel 1979)
+        radius, turn = 7.0 * math.sqrt((k + 0.5) / KEY_LIGHTS), 2.399963 * k
+        add(azimuth - 48.0 + radius * math.cos(turn), 47.0 + radius * math.sin(turn), KEY_SHARE / KEY_LIGHTS)
     ring = ((22.0, 5, 0.3), (50.0, 4, 0.45), (82.0, 1, 0.25))
     for elevation, count, share in ring:
         for k in range(count):
@@ -68,29 +76,47 @@ def _lights(azimuth: int) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class _ShadowMaps:
+    """One alpha and depth image per light, and the sphere in m that they cover."""
+
+    centre: torch.Tensor
+    radius: float
+    directions: torch.Tensor
+    weights: torch.Tensor
     cameras: Cameras
     alpha: torch.Tensor
     depth: torch.Tensor
     bias: float
     softness: float
 
-    def visibility(self, points: torch.Tensor) -> torch.Tensor:
-        """How much of each light reaches `points` [M, 3]; [L, M] in [0, 1]."""
-        view = self.cameras.viewmats.to(points)
-        local = torch.einsum("lij,mj->lmi", view[:, :3, :3], points) + view[:, None, :3, 3]
-        k = self.cameras.Ks.to(points)
-        z = local[..., 2].clamp_min(1e-6)
-        u = k[:, None, 0, 0] * local[..., 0] / z + k[:, None, 0, 2]
-        v = k[:, None, 1, 1] * local[..., 1] / z + k[:, None, 1, 2]
-        grid = torch.stack([2.0 * u / self.cameras.width - 1.0, 2.0 * v / self.cameras.height - 1.0], -1)
-        maps = torch.stack([self.alpha, self.depth], 1)
-        sampled = torch.nn.functional.grid_sample(maps, grid[:, :, None, :], align_corners=False)[..., 0]
-        alpha, depth = sampled[:, 0], sampled[:, 1]
-        behind = (local[..., 2] - depth / alpha.clamp_min(1e-6) - self.bias) / self.softness
-        return 1.0 - alpha * behind.clamp(0.0, 1.0)
+    def gather(self, points: torch.Tensor, normals: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Light of the key and of the sky, and the key's visibility, at points and unit normals [M, 3]."""
+        device = points.device
+        name = "cpu" if device.type == "cpu" else str(wp.device_from_torch(device))
+        light = torch.empty((len(points), 3), dtype=torch.float32, device=device)
+        launch_chunked(
+            gather_light,
+            len(points),
+            [
+                wp.from_torch(points.contiguous(), dtype=wp.vec3),
+                wp.from_torch(normals.contiguous(), dtype=wp.vec3),
+                wp.from_torch(self.alpha.contiguous()),
+                wp.from_torch(self.depth.contiguous()),
+                wp.from_torch(self.cameras.viewmats.to(device).contiguous(), dtype=wp.mat44),
+                float(self.cameras.Ks[0, 0, 0]),
+                wp.from_torch(self.directions, dtype=wp.vec3),
+                wp.from_torch(self.weights),
+                KEY_LIGHTS,
+                self.bias,
+                self.softness,
+            ],
+            [wp.from_torch(light, dtype=wp.vec3)],
+            device=name,
+            minimum=2048,
+        )
+        return light.unbind(1)
 
 
-def _shadow_maps(gaussians: Gaussians, directions: np.ndarray) -> _ShadowMaps:
+def _shadow_maps(gaussians: Gaussians, directions: np.ndarray, weights: np.ndarray) -> _ShadowMaps:
     low = gaussians.means.amin(0).double().cpu().numpy()
     high = gaussians.means.amax(0).double().cpu().numpy()
     centre, radius = 0.5 * (low + high), max(0.55 * float(np.linalg.norm(high - low)), 1e-6)
@@ -117,30 +143,31 @@ def _shadow_maps(gaussians: Gaussians, directions: np.ndarray) -> _ShadowMaps:
         render_mode="D",
     )
     texel = 2.0 * radius / MAP_SIZE
-    return _ShadowMaps(cameras, alpha[..., 0], depth[..., 0], 2.5 * texel, 3.0 * texel)
+    as_tensor = functools.partial(torch.tensor, dtype=torch.float32, device=device)
+    middle, towards, strength = as_tensor(centre), as_tensor(directions), as_tensor(weights)
+    return _ShadowMaps(
+        middle, radius, towards, strength, cameras, alpha[..., 0], depth[..., 0], 2.5 * texel, 3.0 * texel
+    )
 
 
-def light(gaussians: Gaussians, normals: torch.Tensor, cameras: Cameras) -> tuple[Gaussians, _ShadowMaps]:
+def light(
+    gaussians: Gaussians, normals: torch.Tensor, cameras: Cameras, studio: Studio
+) -> tuple[Gaussians, _ShadowMaps]:
     """Gaussians with studio light multiplied into their colours, and the shadow maps that were made for it.
 
     normals: [N, 3] unit. The key light stands on the side of the first camera.
     """
     eye = cameras.positions[0].to(gaussians.means)
-    middle = gaussians.means.mean(0)
-    azimuth = round(math.degrees(math.atan2(float(eye[1] - middle[1]), float(eye[0] - middle[0]))))
-    directions, weights = _lights(azimuth)
-    maps = _shadow_maps(gaussians, directions)
-    towards = torch.tensor(directions, dtype=torch.float32, device=gaussians.means.device)
-    strength = torch.tensor(weights, dtype=torch.float32, device=gaussians.means.device)
-    visible = maps.visibility(gaussians.means + normals * maps.bias)
-    cosine = (normals @ towards.T).clamp_min(0.0).T
-    received = (strength[:, None] * cosine * visible).sum(0) + BOUNCE * (1.0 - 0.5 * normals[:, 2])
-    factor = received.clamp(0.0, 1.6).pow(1.0 / GAMMA)
+    across = [float(eye[k]) - studio.focus[k] for k in (0, 1)]
+    directions, weights = _lights(round(math.degrees(math.atan2(across[1], across[0]))))
+    maps = _shadow_maps(gaussians, directions, weights)
+    key, sky, seen = maps.gather(gaussians.means + normals * maps.bias, normals)
+    factor = (key + sky + BOUNCE * (1.0 - 0.5 * normals[:, 2])).clamp(0.0, 1.6).pow(1.0 / GAMMA)
 
     # Blinn-Phong highlight of the key light; Schlick-free, it only has to read as a glossy surface.
     to_eye = torch.nn.functional.normalize(eye - gaussians.means, dim=1)
-    half = torch.nn.functional.normalize(to_eye + towards[:4].mean(0), dim=1)
-    gloss = GLOSS * (normals * half).sum(1).clamp_min(0.0).pow(60.0) * visible[:4].mean(0)
+    half = torch.nn.functional.normalize(to_eye + maps.directions[:KEY_LIGHTS].mean(0), dim=1)
+    gloss = GLOSS * (normals * half).sum(1).clamp_min(0.0).pow(60.0) * seen
 
     sh = gaussians.sh * factor[:, None, None]
     sh[:, 0] += ((0.5 * factor - 0.5 + gloss) / SH_C0)[:, None]
@@ -154,26 +181,26 @@ class _Backdrop:
     sky:    [H, W, 3] what is seen where there is no floor
     base:   [H, W, 3] the floor in full light, grid included
     fade:   [H, W, 1] how much of the floor shows before it melts into the sky
-    uv:     [H, W, 2] where a pixel's floor point lies in the floor's shade map
-    centre: [2] m, half: m; the square the shade map covers
+    floor:  [H, W, 2] m, the floor point a pixel sees
+    height: of the floor, m
     """
 
     sky: torch.Tensor
     base: torch.Tensor
     fade: torch.Tensor
-    uv: torch.Tensor
-    centre: torch.Tensor
-    half: float
+    floor: torch.Tensor
+    height: float
 
-    def picture(self, maps: _ShadowMaps | None, height: float) -> torch.Tensor:
+    def picture(self, maps: _ShadowMaps | None) -> torch.Tensor:
         """The backdrop under the shadows of `maps`, [H, W, 3]."""
         base = self.base
         if maps is not None:
-            shade = _floor_shade(maps, self.centre, self.half, height)
-            sampled = torch.nn.functional.grid_sample(
-                shade[None, None], self.uv[None], padding_mode="border", align_corners=False
-            )
-            base = base * sampled[0, 0, :, :, None]
+            centre = maps.centre[:2].to(self.floor)
+            half = 2.0 * maps.radius + 1.2 * max(float(maps.centre[2]) - self.height, 0.0)
+            shade = _floor_shade(maps, centre, half, self.height)
+            uv = ((self.floor - centre) / half)[None]
+            darkening = torch.nn.functional.grid_sample(1.0 - shade[None, None], uv, align_corners=False)
+            base = base * (1.0 - darkening[0, 0, :, :, None])
         return self.sky + (base - self.sky) * self.fade
 
 
@@ -200,8 +227,8 @@ def _backdrop(cameras: Cameras, studio: Studio, device: torch.device) -> _Backdr
     below = lift < -1e-4
     t = (studio.ground - eye[2]) / torch.where(below, lift, torch.full_like(lift, -1e-4))
     hit = (eye + rays * t)[..., :2]
-    centre = _looked_at(cameras, studio).to(device)
-    reach = torch.linalg.norm(hit - centre, dim=-1, keepdim=True)
+    focus = torch.tensor(studio.focus[:2], dtype=torch.float32, device=device)
+    reach = torch.linalg.norm(hit - focus, dim=-1, keepdim=True)
     base = torch.tensor([0.835, 0.845, 0.855], device=device).expand(h, w, 3)
     spacing = 10.0 ** math.floor(math.log10(max(studio.scale, 1e-6) * 0.8))
     foot = 0.75 * (t / k[1, 1]) / (-lift).clamp_min(0.02)  # metres of floor under a pixel
@@ -210,8 +237,7 @@ def _backdrop(cameras: Cameras, studio: Studio, device: torch.device) -> _Backdr
         cover = ((half + 0.5 * foot - nearest) / foot).clamp(0.0, 1.0) * (2.0 * half / foot).clamp(max=1.0)
         base = base - strength * (1.0 - (1.0 - cover).prod(-1, keepdim=True))
     fade = torch.exp(-((reach / (5.0 * studio.scale)) ** 2)) * below
-    half = 3.0 * studio.scale
-    return _Backdrop(sky, base, fade, (hit - centre) / half, centre, half)
+    return _Backdrop(sky, base, fade, hit, studio.ground)
 
 
 def _floor_shade(maps: _ShadowMaps, centre: torch.Tensor, half: float, height: float) -> torch.Tensor:
@@ -222,10 +248,8 @@ def _floor_shade(maps: _ShadowMaps, centre: torch.Tensor, half: float, height: f
     points = torch.stack(
         [centre[0] + half * x, centre[1] + half * y, torch.full_like(x, height)], -1
     ).reshape(-1, 3)
-    directions = -maps.cameras.viewmats[:, 2, :3].to(device)
-    weights = torch.tensor(_lights(0)[1], dtype=torch.float32, device=device) * directions[:, 2]
-    visible = (weights[:, None] * maps.visibility(points)).reshape(-1, FLOOR_SIZE, FLOOR_SIZE)
-    key, sky = visible[:4].sum(0), visible[4:].sum(0)
+    up = torch.tensor([0.0, 0.0, 1.0], device=device).expand(len(points), 3)
+    key, sky = (light.reshape(FLOOR_SIZE, FLOOR_SIZE) for light in maps.gather(points, up)[:2])
     # A few sky lights stand for the whole sky: blur what they draw, not the key light's shadow.
     offsets = torch.arange(-7, 8, device=device)
     kernel = torch.exp(-0.5 * (offsets / 3.0) ** 2)
@@ -233,16 +257,7 @@ def _floor_shade(maps: _ShadowMaps, centre: torch.Tensor, half: float, height: f
     padded = torch.nn.functional.pad(sky[None, None], (7, 7, 7, 7), mode="replicate")
     sky = torch.nn.functional.conv2d(padded, kernel.view(1, 1, 1, -1))
     sky = torch.nn.functional.conv2d(sky, kernel.view(1, 1, -1, 1))[0, 0]
-    return 0.08 + 0.92 * (key + sky).clamp(0.0, 1.0).pow(1.0 / GAMMA)
-
-
-def _looked_at(cameras: Cameras, studio: Studio) -> torch.Tensor:
-    """Where the first camera's axis meets the floor (or the point below a camera that looks up), [2]."""
-    eye, forward = cameras.positions[0], cameras.viewmats[0, 2, :3]
-    down = float(-forward[2])
-    height = float(eye[2]) - float(studio.ground or 0.0)
-    t = min(height / down, 12.0 * studio.scale) if down > 1e-3 else 4.0 * studio.scale
-    return (eye + forward * t)[:2]
+    return 0.06 + 0.94 * (key + sky).clamp(0.0, 1.0).pow(1.0 / GAMMA)
 
 
 class Renderer:
@@ -265,7 +280,7 @@ class Renderer:
         one = self.cameras[camera]
         lit, maps = gaussians, None
         if self.studio.shading == "studio" and len(gaussians):
-            lit, maps = light(gaussians, normals, one)
+            lit, maps = light(gaussians, normals, one, self.studio)
         color, alpha, _ = rasterization(
             lit.means,
             lit.quats,
@@ -283,7 +298,7 @@ class Renderer:
             self._backdrops[key] = _backdrop(one, self.studio, device)
         backdrop = self._backdrops[key]
         if isinstance(backdrop, _Backdrop):
-            backdrop = backdrop.picture(maps, float(self.studio.ground or 0.0))
+            backdrop = backdrop.picture(maps)
         picture = color[0] + (1.0 - alpha[0]) * backdrop
         return (picture.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8).cpu().numpy()
 
@@ -317,7 +332,7 @@ def frame_camera(
         tan_h = tan_v * width / height
         depth = offset @ direction
         needed = np.maximum(np.abs(offset @ right) / tan_h, np.abs(offset @ upward) / tan_v) + depth
-        distance = max(1.12 * float(needed.max()), 1e-3)
+        distance = max(1.06 * float(needed.max()), 1e-3)
         eye = centre + distance * direction
     return Cameras.look_at(np.asarray(eye, float), centre, vertical_fov=vertical, width=width, height=height)
 

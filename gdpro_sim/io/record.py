@@ -24,7 +24,7 @@ import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.cameras import Cameras
 from gdpro_sim.errors import OutputError
-from gdpro_sim.files import atomic_write, prepare_folder, sha256_of
+from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
 from gdpro_sim.io.images import read_png, spread, write_contact_sheet, write_png, write_video
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.usd import SimulationWriter, body_records
@@ -81,6 +81,9 @@ def record(
     """
     checked = scene if isinstance(scene, Scene) else load_scene(scene)
     folder = prepare_folder(output, "simulation.usdc")
+    frames = prepare_folder(folder / "frames", _frame_name(0))
+    remove_stale(folder)
+    remove_stale(frames)
     store = _Store(folder / ".resume", _fingerprint(checked, device), fresh)
     report = on_progress or (lambda phase, done, total: None)
     seconds: dict[str, float] = {}
@@ -98,8 +101,6 @@ def record(
     seconds["prepare"] = time.perf_counter() - begin
 
     renderer = Renderer(_camera(checked, simulation), _studio(checked, simulation))
-    frames = folder / "frames"
-    frames.mkdir(exist_ok=True)
     rows = _run(simulation, folder, store, renderer, report)
 
     begin = time.perf_counter()
@@ -260,11 +261,13 @@ def _camera(scene: Scene, simulation: Simulation) -> Cameras:
 
 def _studio(scene: Scene, simulation: Simulation) -> Studio:
     sizes = [float(np.ptp(body.surface, axis=0).max()) for body in simulation.model.bodies]
+    middle = np.mean([body.surface.mean(axis=0) for body in simulation.model.bodies], axis=0)
     return Studio(
         shading=scene.render.shading,
         background=scene.render.background,
         ground=None if scene.ground is None else scene.ground.height,
         scale=max(sizes),
+        focus=(float(middle[0]), float(middle[1]), float(middle[2])),
     )
 
 

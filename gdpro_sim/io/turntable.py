@@ -95,7 +95,8 @@ def _turntable(low: np.ndarray, high: np.ndarray, views: int, view: dict[str, An
 
 
 def _studio(low: np.ndarray, high: np.ndarray, ground: float | None, shading: str, background: str) -> Studio:
-    return Studio(shading, background, ground, float((high - low).max()))
+    x, y, z = (0.5 * (low + high)).tolist()
+    return Studio(shading, background, ground, float((high - low).max()), (x, y, z))
 
 
 def _bounds(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
