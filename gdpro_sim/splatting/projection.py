@@ -77,14 +77,24 @@ class Projection:
 
 
 def array(tensor: torch.Tensor, dtype: type) -> Any:
-    """The tensor's memory as a Warp array; trailing axes become vectors or matrices where `dtype` is one."""
-    return wp.from_torch(tensor, dtype=dtype, requires_grad=False)
+    """The tensor's memory as a kernel argument; trailing axes become a vector or matrix where `dtype` is one.
+
+    It does not keep the tensor alive.
+    """
+    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def device_name(tensor: torch.Tensor) -> str:
     """Warp's name of the tensor's device; starts Warp where it is not yet running."""
     wp.init()
     return str(wp.device_from_torch(tensor.device))
+
+
+def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int = 32) -> None:
+    """Sort `values` [2 count] with their `keys` [2 count] by the keys' lowest `bits`; stable, in place."""
+    keys_array: Any = wp.from_torch(keys)
+    values_array: Any = wp.from_torch(values)
+    wp.utils.radix_sort_pairs(keys_array, values_array, count, end_bit=bits)
 
 
 def project(
@@ -127,7 +137,7 @@ def project(
         device=device,
     )
     for camera in range(cameras):
-        wp.utils.radix_sort_pairs(array(keys[camera], wp.float32), array(order[camera], wp.int32), count)
+        sort_pairs(keys[camera], order[camera], count)
     return Projection(records, radii, rects, order, cameras, count)
 
 
@@ -190,4 +200,5 @@ __all__ = [
     "project",
     "shade_features",
     "shade_harmonics",
+    "sort_pairs",
 ]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+import warp as wp
 
 from gdpro_sim.splatting.checks import (
     INDEX_LIMIT,
@@ -16,8 +18,15 @@ from gdpro_sim.splatting.checks import (
     check_tensor,
 )
 from gdpro_sim.splatting.compositing import Composite, composite
-from gdpro_sim.splatting.projection import Projection, View, project, shade_features, shade_harmonics
-from gdpro_sim.splatting.tiles import count_and_fill, empty_lists, expand_and_sort
+from gdpro_sim.splatting.projection import (
+    Projection,
+    View,
+    device_name,
+    project,
+    shade_features,
+    shade_harmonics,
+)
+from gdpro_sim.splatting.tiles import TileLists, count_and_fill, empty_lists, expand_and_sort
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -150,23 +159,18 @@ def rasterization(
             f'RasterOptions.method "tile" runs on the CPU only; the tensors are on {means.device}'
         )
 
-    if cameras == 0 or count == 0:
-        projection = _nothing(cameras, count, means)
-        lists = empty_lists(cameras, view, means.device)
-        flat = None
-    else:
-        projection = project(means, quats, scales, opacities, view)
-        if with_colors and sh_degree is not None:
-            shade_harmonics(projection, means, colors, sh_degree, view)
-            flat = None
-        else:
-            flat = colors.reshape(-1, features) if with_colors else means.new_empty((count, 0))
-            shade_features(projection, flat)
-        lists = (count_and_fill if tile else expand_and_sort)(projection, view, options.max_tile_entries)
-    if cameras == 0:
-        result = _no_images(view, channels, means)
-    else:
-        result = composite(projection, lists, flat, background, divided, view, tile=tile)
+    drawn = colors if with_colors else means.new_empty((count, 0))
+    with _torch_stream(means):
+        projection, lists, result = _render(
+            (means, quats, scales, opacities),
+            drawn,
+            sh_degree if with_colors else None,
+            background,
+            divided,
+            view,
+            options.max_tile_entries,
+            tile=tile,
+        )
     meta = {
         "width": width,
         "height": height,
@@ -186,6 +190,46 @@ def rasterization(
         "composite": result,
     }
     return result.image, result.alphas, meta
+
+
+def _render(
+    gaussians: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
+    colors: torch.Tensor,
+    sh_degree: int | None,
+    background: torch.Tensor,
+    divided: int,
+    view: View,
+    limit: int,
+    *,
+    tile: bool,
+) -> tuple[Projection, TileLists, Composite]:
+    """The three stages over checked arguments; `colors` [N, K, 3], or [N, F] or [C, N, F] with F >= 0."""
+    means = gaussians[0]
+    cameras, count = len(view.viewmats), len(means)
+    if cameras == 0:
+        lists = empty_lists(0, view, means.device)
+        return _nothing(0, count, means), lists, _no_images(view, background.shape[1], means)
+    flat = None if sh_degree is not None else colors.flatten(0, -2)
+    if count == 0:
+        projection = _nothing(cameras, 0, means)
+        lists = empty_lists(cameras, view, means.device)
+    else:
+        projection = project(*gaussians, view)
+        if flat is None:
+            assert sh_degree is not None
+            shade_harmonics(projection, means, colors, sh_degree, view)
+        else:
+            shade_features(projection, flat)
+        lists = (count_and_fill if tile else expand_and_sort)(projection, view, limit)
+    return projection, lists, composite(projection, lists, flat, background, divided, view, tile=tile)
+
+
+def _torch_stream(tensor: torch.Tensor) -> AbstractContextManager[object]:
+    """Run Warp's work on torch's current CUDA stream, so neither has to wait for the other."""
+    if tensor.device.type == "cpu":
+        return nullcontext()
+    device_name(tensor)
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
 
 
 def _check_colors(

@@ -11,7 +11,7 @@ from gdpro_sim.device import launch_chunked, thread_count
 from gdpro_sim.kernels import tiles as kernels
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting.checks import INDEX_LIMIT, check_count
-from gdpro_sim.splatting.projection import Projection, View, array, device_name
+from gdpro_sim.splatting.projection import Projection, View, array, device_name, sort_pairs
 
 PART = 4096
 """Fewest Gaussians worth a part (and so a thread) of the counting sort."""
@@ -84,11 +84,11 @@ def expand_and_sort(projection: Projection, view: View, limit: int = INDEX_LIMIT
     begins = (ends - counts).to(torch.int32)
     keys = torch.empty(2 * entries, dtype=torch.int32, device=device)
     ids = torch.empty(2 * entries, dtype=torch.int32, device=device)
-    keys_array, ids_array = array(keys, wp.int32), array(ids, wp.int32)
+    keys_array = array(keys, wp.int32)
     inputs = [order, rects, projection.gaussians, array(begins, wp.int32), columns, rows]
-    launch_chunked(kernels.expand_tiles, total, inputs, [keys_array, ids_array], device=name)
+    launch_chunked(kernels.expand_tiles, total, inputs, [keys_array, array(ids, wp.int32)], device=name)
     bits = max(1, (tiles - 1).bit_length())
-    wp.utils.radix_sort_pairs(keys_array, ids_array, entries, end_bit=bits)
+    sort_pairs(keys, ids, entries, bits)
     offsets = torch.empty(tiles + 1, dtype=torch.int32, device=device)
     outputs = [array(offsets, wp.int32)]
     launch_chunked(kernels.find_tiles, entries + 1, [keys_array, entries], outputs, device=name)
