@@ -1,0 +1,30 @@
+"""What the figures were measured on."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+
+import warp as wp
+
+from gdpro_sim.device import resolve_device, thread_count
+
+
+def machine(device: str = "cpu") -> str:
+    """One line: processor (and GPU), cores, threads, load, versions, date."""
+    name = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as info:
+            name = next(line.split(":", 1)[1].strip() for line in info if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    resolved = resolve_device(device)
+    gpu = "" if resolved == "cpu" else f", {wp.get_device(resolved).name}"
+    return (
+        f"{name}{gpu}, {os.cpu_count()} cores, {thread_count()} threads, load {os.getloadavg()[0]:.1f}, "
+        f"Python {platform.python_version()}, Warp {wp.config.version}, {datetime.date.today().isoformat()}"
+    )
+
+
+__all__ = ["machine"]
