@@ -157,3 +157,18 @@ def test_projection_in_meta() -> None:
     difference = (meta["radii"][0] - extents)[drawn]
     assert difference.min() >= 0
     assert difference.max() < 1.01
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_camera_inside_the_cloud(seed: int) -> None:
+    """Gaussians past the image border: perspective is linearized at a point pulled in."""
+    scene, views = cloud(150, 20 + seed, size=0.15), cameras(1, 40, 30, distance=0.4)
+    colors = features(150, 3, seed)
+    image, alpha, meta = rasterization(**scene, colors=colors, **views)
+    expected, expected_alpha, _, margin = rasterize(**scene, colors=colors, **views)
+    means2d, radii = meta["means2d"][0], meta["radii"][0]
+    size = torch.tensor([40, 30])
+    beyond = ((means2d < -0.15 * size) | (means2d > 1.15 * size)).any(1) & (radii > 0).all(1)
+    assert beyond.sum() > 5
+    assert_close(image, expected, margin, 5 * TOLERANCE)
+    assert_close(alpha[..., 0], expected_alpha, margin, 5 * TOLERANCE)
