@@ -79,7 +79,7 @@ _TILE_SNIPPET = f"""
     int at = begin;
     for (; at < end && alive; ++at) {{
         const size_t g = (size_t)id[at];
-        if (at + 4 < end) __builtin_prefetch(record + (size_t)id[at + 4] * {RECORD});
+        if (end - at > 4) __builtin_prefetch(record + (size_t)id[at + 4] * {RECORD});
         const float* const r = record + g * {RECORD};
         const float dx = (float)tile_x + 0.5f - r[{MEAN}], dy = (float)tile_y + 0.5f - r[{MEAN + 1}];
         const float a = r[{FACTOR}], b = r[{FACTOR + 1}], d = r[{FACTOR + 2}];

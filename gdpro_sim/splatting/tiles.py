@@ -29,13 +29,6 @@ class TileLists:
     ids: torch.Tensor
 
 
-def bin_tiles(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
-    """List each tile's Gaussians by depth. Raises RequestError where more than `limit` entries are needed."""
-    if projection.records.device.type == "cpu":
-        return count_and_fill(projection, view, limit)
-    return expand_and_sort(projection, view, limit)
-
-
 def empty_lists(cameras: int, view: View, device: torch.device) -> TileLists:
     columns, rows = view.tiles
     return TileLists(
@@ -45,7 +38,10 @@ def empty_lists(cameras: int, view: View, device: torch.device) -> TileLists:
 
 
 def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
-    """Counting sort, for CPUs. The lists do not depend on the number of threads."""
+    """Counting sort, for CPUs; the lists do not depend on the number of threads.
+
+    Raises RequestError where more than `limit` entries are needed.
+    """
     columns, rows = view.tiles
     tiles = projection.cameras * rows * columns
     parts = max(1, min(thread_count(), projection.gaussians // PART))
@@ -66,7 +62,10 @@ def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT)
 
 
 def expand_and_sort(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
-    """Pairs in depth order, then a stable radix sort by tile; for GPUs."""
+    """The same lists from pairs in depth order and a stable radix sort by tile, for GPUs.
+
+    Raises RequestError where more than `limit` entries are needed.
+    """
     columns, rows = view.tiles
     tiles = projection.cameras * rows * columns
     total = len(projection.records)
@@ -95,4 +94,4 @@ def expand_and_sort(projection: Projection, view: View, limit: int = INDEX_LIMIT
     return TileLists(offsets, ids[:entries])
 
 
-__all__ = ["TileLists", "bin_tiles", "count_and_fill", "empty_lists", "expand_and_sort"]
+__all__ = ["TileLists", "count_and_fill", "empty_lists", "expand_and_sort"]
