@@ -150,7 +150,9 @@ def bind_mesh(
 
     A dense mesh is decimated and a coarse one subdivided first, so `vertices` and `faces` of the result need
     not be the mesh's. Colours are sampled on the mesh as given. SH degree 0. The same arguments give the same
-    bytes. Raises `MeshError` for a budget below 100, or one too small for a mesh that cannot be decimated
+    bytes. Splats carry no light, so a mesh of one plain colour would be a silhouette: `shading` (0 for none)
+    is the share of a soft light from above, ambient occlusion included, baked into such a mesh's Gaussians.
+    Raises `MeshError` for a budget below 100, or one too small for a mesh that cannot be decimated
     enough.
     """
     if budget < MIN_BUDGET:
@@ -165,7 +167,7 @@ def bind_mesh(
             f"of the budget of {budget:,}; raise the budget to {len(f):,} or join the mesh's loose pieces"
         )
     areas = face_areas(v, f)
-    # A sliver takes as many as a broader triangle of its length: few long Gaussians would stick out as spikes.
+    # A sliver takes as many as a broader triangle of its length: a few long Gaussians would show as spikes.
     longest = np.linalg.norm(v[f] - v[f[:, [1, 2, 0]]], axis=2).max(1)
     per_face = counts_per_face(np.maximum(areas, SLIVER * longest**2), budget, seed)
     face_ids = np.repeat(np.arange(len(f), dtype=np.int32), per_face)
@@ -179,7 +181,7 @@ def bind_mesh(
     rgba = _patch_colors(
         mesh, surface, face_ids, weights, per_face[face_ids], areas[face_ids] / per_face[face_ids]
     )
-    if shading > 0.0 and np.ptp(rgba, axis=0).max() < 1e-6:
+    if shading > 0.0 and _plain(mesh):
         light = _vertex_light(v, f)
         rgba[:, :3] *= 1.0 - shading * (1.0 - np.einsum("nc,nc->n", weights, light[f[face_ids]])[:, None])
     opacity = np.clip(OPACITY * rgba[:, 3], 0.005, OPACITY)
@@ -305,6 +307,13 @@ def _patch_colors(
             barycentric = np.einsum("nc,ncp->np", at, surface.corners[face_ids])
         total += colors.at(where, barycentric, share / samples)
     return (total / samples).astype(np.float32)
+
+
+def _plain(mesh: SurfaceMesh) -> bool:
+    """Neither texture nor corner colours, and one base colour."""
+    textured = mesh.uv is not None and any(m.texture is not None for m in mesh.materials)
+    used = {mesh.materials[i].base_color for i in np.unique(mesh.material_ids)}
+    return not textured and mesh.colors is None and len(used) == 1
 
 
 def _vertex_light(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from gdpro_sim.meshing.repair import (
     turn_faces,
     validate,
     weld,
+    weld_seams,
 )
 from gdpro_sim.meshing.surface import MeshMaterial, SurfaceMesh
 
@@ -238,7 +239,7 @@ def _color(
 def _finish(part: RawPart, path: Path, raw: RawMesh) -> SurfaceMesh:
     messages = raw.messages
     vertices, faces = weld(part.vertices.astype(np.float32), part.faces)
-    part.faces = faces
+    part.faces = weld_seams(vertices, faces)
     flat = degenerate_faces(vertices, faces)
     if flat.any():
         messages.append(f"dropped {int(flat.sum())} of {len(flat)} faces of zero area")

@@ -14,8 +14,9 @@ from gdpro_sim.meshing.surface import MeshMaterial
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
 
-MAX_FACES = 4_000_000
-"""More triangles than this are refused: reading and decimating them stays within about 2 GB of memory."""
+MAX_FACES = 3_000_000
+"""More triangles than this are refused: reading and decimating them takes about 2 GB of memory at that
+size."""
 
 
 @dataclass

@@ -27,11 +27,12 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
         low, high = v.min(0).astype(np.float64), v.max(0).astype(np.float64)
         centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low)) or 1.0
         unit = (v.astype(np.float64) - centre) / size
-        for aggression in (5.0, 7.0, 10.0):  # the first keeps the shape best but may stop short
+        out, kept = unit, np.ascontiguousarray(f)
+        for aggression in (5.0, 7.0, 7.0, 10.0, 10.0):  # the first keeps the shape best but may stop short
             out, kept = fast_simplification.simplify(
-                unit, np.ascontiguousarray(f), target_count=int(target_faces), agg=aggression
+                out, np.ascontiguousarray(kept), target_count=int(target_faces), agg=aggression
             )
-            if len(kept) <= 1.2 * target_faces:
+            if len(kept) <= 1.1 * target_faces:
                 break
         v, f = (out * size + centre).astype(np.float32), kept.astype(np.int32)
         if not len(f):
@@ -42,7 +43,7 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
 
 
 def subdivide(
-    vertices: np.ndarray, faces: np.ndarray, max_edge: float, *, max_faces: int = 4_000_000
+    vertices: np.ndarray, faces: np.ndarray, max_edge: float, *, max_faces: int = 3_000_000
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Split edges longer than `max_edge` metres at their midpoint, in all faces that share them: no
     T-junctions.

@@ -145,8 +145,8 @@ def check_arrays(vertices: np.ndarray, faces: np.ndarray, name: str = "mesh") ->
         raise MeshError(f"{name}: {bad} of {len(vertices)} vertices are NaN or infinite; remove them first")
 
 
-def weld(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices at the same place (within `tolerance` metres) and drop unused ones.
+def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Merge vertices at the very same place and drop unused ones.
 
     Returns vertices [V', 3] and faces [F, 3] in the same face order; faces may become degenerate.
     """
@@ -167,16 +167,33 @@ def weld(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 0.0) -> tup
     group[order] = rank[np.cumsum(new) - 1]
     v = v[np.sort(first)]
     f = group[f]
-    if tolerance > 0.0 and len(v) > 1:
-        pairs = cKDTree(v).query_pairs(tolerance, output_type="ndarray")
-        if len(pairs):
-            graph = sparse.coo_matrix(
-                (np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(v),) * 2
-            )
-            labels = csgraph.connected_components(graph, directed=False)[1]
-            _, first, merged = np.unique(labels, return_index=True, return_inverse=True)
-            v, f = v[first], merged[f]
     return np.ascontiguousarray(v), np.ascontiguousarray(f.astype(np.int32))
+
+
+def weld_seams(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Faces [F, 3] whose open edges are sewn where rounding alone keeps vertices apart (1e-6 of the
+    diagonal).
+
+    Only vertices on open edges move together, and only if that closes edges. The vertices stay as they are.
+    """
+    keys, _ = edge_keys(faces)
+    _, first, counts = np.unique(keys, return_index=True, return_counts=True)
+    half = first[counts == 1]
+    if not len(half):
+        return faces
+    ends = np.concatenate([faces.ravel()[half], faces[:, [1, 2, 0]].ravel()[half]])
+    rim = np.unique(ends)
+    tolerance = 1e-6 * float(np.linalg.norm(np.ptp(vertices.astype(np.float64), axis=0)))
+    pairs = cKDTree(vertices[rim]).query_pairs(tolerance, output_type="ndarray")
+    if not len(pairs):
+        return faces
+    graph = sparse.coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(rim),) * 2)
+    labels = csgraph.connected_components(graph, directed=False)[1]
+    target = np.arange(len(vertices))
+    target[rim] = rim[np.unique(labels, return_index=True)[1]][labels]
+    sewn = target[faces].astype(faces.dtype)
+    _, counts = np.unique(edge_keys(sewn)[0], return_counts=True)
+    return sewn if int((counts == 1).sum()) < len(half) else faces
 
 
 def duplicate_faces(faces: np.ndarray) -> np.ndarray:
@@ -236,7 +253,7 @@ def consistent_winding(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return turned ^ (share > 0.5)[labels], labels.astype(np.int32)
 
 
-def _winding_number(point: np.ndarray, triangles: np.ndarray) -> float:
+def winding_number(point: np.ndarray, triangles: np.ndarray) -> float:
     """Generalised winding number of one point over triangles [F, 3, 3] (Van Oosterom & Strackee 1983)."""
     d = triangles - point
     length = np.linalg.norm(d, axis=2)
@@ -266,18 +283,16 @@ def outward_orientation(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     flux = np.einsum("fc,fc->f", v[faces[:, 0]] - centres[labels], normals)
     volumes = np.bincount(labels, weights=flux, minlength=count) / 6.0
     scale = np.bincount(labels, weights=np.linalg.norm(normals, axis=1), minlength=count) ** 1.5
-    inward = volumes < -1e-9 * scale
-    turn = np.zeros(count, bool)
-    if (inward.all() and count > 1) or count == 1:
-        turn = inward
-    else:
-        negative = np.flatnonzero(inward)
-        turn[negative] = True
-        for piece in negative[np.argsort(volumes[negative])][:NESTING_CHECKS]:
-            others = labels != piece
-            point = centroid[np.flatnonzero(~others)[0]]
-            if abs(_winding_number(point, v[faces[others]])) > 0.5:
-                turn[piece] = False
+    # Everything inside out is turned first; the pieces are then judged as they would lie.
+    whole = bool(volumes.sum() < -1e-9 * scale.sum())
+    turn = (-volumes if whole else volumes) < -1e-9 * scale
+    inward = np.flatnonzero(turn)
+    for piece in inward[np.argsort(-np.abs(volumes[inward]))][:NESTING_CHECKS]:
+        others = labels != piece
+        point = centroid[np.flatnonzero(~others)[0]]
+        if others.any() and abs(winding_number(point, v[faces[others]])) > 0.5:
+            turn[piece] = False
+    turn ^= whole
     return turn[labels]
 
 
@@ -296,6 +311,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     check_arrays(vertices, faces)
     v, f = weld(np.asarray(vertices), np.asarray(faces))
+    f = weld_seams(v, f)
     f = f[~degenerate_faces(v, f)]
     f = f[~duplicate_faces(f)] if len(f) else f
     if not len(f):
@@ -321,4 +337,6 @@ __all__ = [
     "turn_faces",
     "validate",
     "weld",
+    "weld_seams",
+    "winding_number",
 ]

@@ -51,6 +51,7 @@ def main(source: str, target: str) -> None:
             edge_length_fac=float(data["edge_length"]),
             epsilon=float(data["epsilon"]),
             vtk_ordering=True,
+            coarsen=True,
             quiet=True,
         )[:2]
     np.savez(target, vertices=np.asarray(vertices, np.float64), tets=np.asarray(tets, np.int32))

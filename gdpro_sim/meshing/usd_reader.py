@@ -3,6 +3,7 @@ surfaces."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ def read_usd(path: Path) -> RawMesh:
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        reason = " ".join(str(error).split())[-200:]
+        said = re.findall(r" : '(.*?)'\s*$", str(error), flags=re.MULTILINE | re.DOTALL)
+        reason = " ".join((said[0] if said else str(error)).split())[:200]
         raise MeshError(f"{path}: cannot be opened as USD ({reason}); check it with usdchecker") from error
     if stage is None:
         raise MeshError(f"{path}: cannot be opened as USD; check it with usdchecker")
