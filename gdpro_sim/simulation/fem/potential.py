@@ -20,9 +20,10 @@ RANGES = 128
 CONTACT_PER_ELASTIC = 3.0
 """Ground stiffness of a vertex as a multiple of its own elastic stiffness."""
 
-STICK_PER_NORMAL = 0.1
-"""Friction spring stiffness over ground stiffness. Stiffer makes the stick-slip kink sharper: from 0.1 to 1
-costs twice the Newton iterations (measured), and buys only a smaller elastic give before slipping."""
+STICK_PER_ELASTIC = 1.0
+"""Friction spring stiffness of a vertex as a multiple of its own elastic stiffness. Stiffer makes the
+stick-slip kink sharper and Newton zigzag across it (ten times the iterations on a soft body, measured), and
+buys only a smaller elastic give before slipping; at 1 that give is that of one more layer of elements."""
 
 CONTACT_SAG = 1e-3
 """Penetration, as a fraction of the body's size, at which one vertex would carry the whole body's weight."""
@@ -68,13 +69,13 @@ class IncrementalPotential:
         self.elements.lam = _reals(rest.lam, device)
         self.elements.damping = _reals(model.rayleigh_stiffness, device)
 
-        stiffness, ramp = _contact_scales(model, rest)
+        stiffness, stick, ramp = _contact_scales(model, rest)
         self.vertices = fem.Vertices()
         self.vertices.mass = _reals(rest.mass, device)
         self.vertices.damping = _reals(rest.mass_damping, device)
         self.vertices.friction = _reals(model.friction, device)
         self.vertices.contact_stiffness = _reals(stiffness, device)
-        self.vertices.stick_stiffness = _reals(STICK_PER_NORMAL * stiffness, device)
+        self.vertices.stick_stiffness = _reals(stick, device)
         self.vertices.contact_ramp = _reals(ramp, device)
         self.vertices.fixed = wp.array(self.fixed.astype(np.int32), dtype=wp.int32, device=device)
         self.vertices.offsets = wp.array(topology.corner_offsets, dtype=wp.int32, device=device)
@@ -283,10 +284,10 @@ def _rest_shapes(model: Model) -> _RestShapes:
     return _RestShapes(np.linalg.inv(shape), volume, mu, lam, mass, mass_damping)
 
 
-def _contact_scales(model: Model, rest: _RestShapes) -> tuple[np.ndarray, np.ndarray]:
-    """Ground stiffness N/m and ramp depth m of each vertex.
+def _contact_scales(model: Model, rest: _RestShapes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ground stiffness N/m, friction spring stiffness N/m and ramp depth m of each vertex.
 
-    The stiffness follows the vertex's own elastic stiffness (so that a stiff body indents the ground no more
+    The ground stiffness follows the vertex's own elastic stiffness (so that a stiff body indents the ground no more
     than itself) and its body's weight (so that a soft one does not sink).
     """
     first = -rest.inverse.sum(axis=1, keepdims=True)
@@ -304,7 +305,7 @@ def _contact_scales(model: Model, rest: _RestShapes) -> tuple[np.ndarray, np.nda
         weight = STANDARD_GRAVITY * float(rest.mass[begin:end].sum())
         stiffness[begin:end] += weight / (CONTACT_SAG * size)
         ramp[begin:end] = CONTACT_RAMP * size
-    return model.fem.contact_stiffness * stiffness, ramp
+    return model.fem.contact_stiffness * stiffness, STICK_PER_ELASTIC * elastic, ramp
 
 
 def _reals(values: np.ndarray, device: str) -> wp.array:
