@@ -25,6 +25,7 @@ from gdpro_sim.splatting import rasterization
 GAMMA = 2.2
 MAP_SIZE = 160
 FLOOR_SIZE = 224
+CASTERS = 20_000
 KEY_SHARE = 0.66
 BOUNCE = 0.10
 GLOSS = 0.16
@@ -121,6 +122,15 @@ def _shadow_maps(gaussians: Gaussians, directions: np.ndarray, weights: np.ndarr
     high = gaussians.means.amax(0).double().cpu().numpy()
     centre, radius = 0.5 * (low + high), max(0.55 * float(np.linalg.norm(high - low)), 1e-6)
     distance = 24.0 * radius
+    # A small map needs no more than some Gaussians, each grown to cover for those left out.
+    stride = math.ceil(len(gaussians) / CASTERS)
+    casters = Gaussians(
+        gaussians.means[::stride],
+        gaussians.quats[::stride],
+        gaussians.scales[::stride] * math.sqrt(stride),
+        gaussians.opacities[::stride],
+        gaussians.sh[::stride],
+    )
     cameras = Cameras.look_at(
         centre + distance * directions,
         centre,
@@ -130,11 +140,11 @@ def _shadow_maps(gaussians: Gaussians, directions: np.ndarray, weights: np.ndarr
     )
     device = gaussians.means.device
     depth, alpha, _ = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        torch.zeros((len(gaussians), 1), device=device),
+        casters.means,
+        casters.quats,
+        casters.scales,
+        casters.opacities,
+        torch.zeros((len(casters), 1), device=device),
         cameras.viewmats.to(device),
         cameras.Ks.to(device),
         cameras.width,

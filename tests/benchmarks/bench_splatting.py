@@ -11,18 +11,16 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import platform
 import time
 from pathlib import Path
 
 import torch
-import warp as wp
 
 from gdpro_sim import device
 from gdpro_sim.cameras import Cameras
 from gdpro_sim.gaussians import rgb_to_sh
 from gdpro_sim.splatting import rasterization
+from tests.benchmarks.machine import machine
 
 CASES = ((10_000, 256), (10_000, 512), (50_000, 512), (200_000, 512))
 
@@ -50,22 +48,6 @@ def front_camera(size: int) -> Cameras:
     """A camera 3.2 m away whose frame the sphere fills."""
     return Cameras.look_at(
         [[0.0, -3.2, 0.6]], [0.0, 0.0, 0.0], vertical_fov=2 * math.asin(1.05 / 3.25), width=size, height=size
-    )
-
-
-def machine() -> str:
-    """Processor, cores, load, versions and date in one line."""
-    model = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
-        ]
-        model = names[0] if names else model
-    return (
-        f"{model}, {len(os.sched_getaffinity(0))} cores, load {os.getloadavg()[0]:.1f}; "
-        f"Python {platform.python_version()}, Warp {wp.__version__}, torch {torch.__version__}; "
-        f"{time.strftime('%Y-%m-%d %H:%M')}"
     )
 
 

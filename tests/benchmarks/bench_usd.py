@@ -1,6 +1,6 @@
 """Time and size of simulation files, as a Markdown table.
 
-    python tests/benchmarks/bench_usd.py [--frames 30] [--folder DIR]
+    python -m tests.benchmarks.bench_usd [--frames 30] [--folder DIR]
 
 Bodies are spheres with a quarter as many vertices as Gaussians (SH degree 0) that stretch and turn. Write is
 the mean over all frames with flushing, closing and fsync included; read is the mean over all frames.
@@ -9,12 +9,8 @@ the mean over all frames with flushing, closing and fsync included; read is the 
 from __future__ import annotations
 
 import argparse
-import datetime
 import math
-import os
-import platform
 import resource
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -22,30 +18,16 @@ from pathlib import Path
 
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from gdpro_sim.asset import Asset
 from gdpro_sim.io.usd import BodyRecord, SimulationReader, SimulationWriter
 from gdpro_sim.simulation.frame import BodyFrame, Frame
 from gdpro_sim.simulation.model import Diagnostics
 from tests.asset.sample import make_bound
+from tests.benchmarks.machine import machine
 
 STILL = Diagnostics(
     0.0, 0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, 0.0, 1.0, 2, 3, 30, True, 1e-6
 )  # fmt: skip
-
-
-def machine() -> str:
-    """One line naming processor, cores, load, versions and date."""
-    name = platform.processor() or platform.machine()
-    with open("/proc/cpuinfo") as info:
-        for line in info:
-            if line.startswith("model name"):
-                name = line.split(":", 1)[1].strip()
-                break
-    load = os.getloadavg()[0]
-    today = datetime.date.today().isoformat()
-    return f"{name}, {os.cpu_count()} cores, load {load:.1f}, Python {platform.python_version()}, {today}"
 
 
 def run(count: int, precision: str, frames: int, folder: Path) -> str:
