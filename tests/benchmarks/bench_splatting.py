@@ -91,7 +91,7 @@ def main() -> None:
     start = time.perf_counter()
     measure(bumpy_sphere(100, 0), front_camera(64), 0, 1)
     first = time.perf_counter() - start
-    cores = len(os.sched_getaffinity(0))
+    cores = device.thread_count()
     print(f"\n{machine()}\n\nFirst image, with whatever had to be compiled: {first:.1f} s\n")
     print(
         "| Gaussians @ pixels | SH degree | 1 thread: wall / CPU ms | " + f"{cores} threads: wall / CPU ms |"
