@@ -1,9 +1,9 @@
 """Runs fTetWild in a process of its own: `python -m gdpro_sim.meshing.tetwild_worker in.npz out.npz`.
 
 fTetWild can crash, run for ever or eat the memory on hostile input; here none of it reaches the caller. The
-input holds `vertices` float64 [V, 3], `faces` int32 [F, 3], `edge_length` and `epsilon` relative to the
-bounding box's diagonal, `seconds` and `bytes`; the output holds `vertices` float64 [P, 3] and `tets` int32
-[T, 4].
+input holds `vertices` float64 [V, 3], `faces` int32 [F, 3], `coarsen`, `edge_length` and `epsilon` relative
+to the bounding box's diagonal, `seconds` and `bytes`; the output holds `vertices` float64 [P, 3] and `tets`
+int32 [T, 4].
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main(source: str, target: str) -> None:
             edge_length_fac=float(data["edge_length"]),
             epsilon=float(data["epsilon"]),
             vtk_ordering=True,
-            coarsen=True,
+            coarsen=bool(data["coarsen"]),
             quiet=True,
         )[:2]
     np.savez(target, vertices=np.asarray(vertices, np.float64), tets=np.asarray(tets, np.int32))

@@ -263,7 +263,8 @@ def test_usd_transforms_axes_units_and_handedness(tmp_path: Path) -> None:
     body = (
         'def Xform "a" { double3 xformOp:translate = (100, 0, 0)\n double3 xformOp:scale = (2, 3, -4)\n'
         ' uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]\n'
-        f' def Mesh "m" {{ {QUAD_CUBE} }}\n def Mesh "hidden" {{ {QUAD_CUBE} token visibility = "invisible"\n }}\n'
+        f' def Mesh "m" {{ {QUAD_CUBE} }}\n'
+        f' def Mesh "hidden" {{ {QUAD_CUBE} token visibility = "invisible"\n }}\n'
         f' def Mesh "guide" {{ {QUAD_CUBE} uniform token purpose = "guide"\n }}\n}}'
     )
     mesh = load_mesh(usd_stage(tmp_path / "a.usda", body, "Y", 0.01))
@@ -282,7 +283,8 @@ def test_usd_transforms_axes_units_and_handedness(tmp_path: Path) -> None:
 def test_usd_display_color(tmp_path: Path, how: str) -> None:
     count = {"constant": 1, "uniform": 6, "vertex": 8, "faceVarying": 24}[how]
     values = ", ".join(["(0.5, 0, 1)"] * count)
-    body = f'def Mesh "m" {{ {QUAD_CUBE} color3f[] primvars:displayColor = [{values}] (interpolation = "{how}")\n}}'
+    color = f'color3f[] primvars:displayColor = [{values}] (interpolation = "{how}")'
+    body = f'def Mesh "m" {{ {QUAD_CUBE} {color}\n}}'
     mesh = load_mesh(usd_stage(tmp_path / "a.usda", body))
     expected = linear_to_srgb(np.asarray([0.5, 0.0, 1.0]))
     assert np.allclose(color_at(mesh, (0.5, -0.5, 1.0))[:3], expected, atol=0.003)
@@ -290,7 +292,8 @@ def test_usd_display_color(tmp_path: Path, how: str) -> None:
 
 def test_usd_uniform_color_follows_its_face(tmp_path: Path) -> None:
     values = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (0,1,1), (1,0,1)"
-    body = f'def Mesh "m" {{ {QUAD_CUBE} color3f[] primvars:displayColor = [{values}] (interpolation = "uniform")\n}}'
+    color = f'color3f[] primvars:displayColor = [{values}] (interpolation = "uniform")'
+    body = f'def Mesh "m" {{ {QUAD_CUBE} {color}\n}}'
     mesh = load_mesh(usd_stage(tmp_path / "a.usda", body, "Z"))
     assert np.array_equal(color_at(mesh, (0.0, 0.5, 0.5))[:3], [1, 0, 0])
     assert np.array_equal(color_at(mesh, (1.0, 0.5, 0.5))[:3], [0, 1, 0])

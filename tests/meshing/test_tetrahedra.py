@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -87,6 +88,12 @@ def test_cube_volume_and_size(method: str) -> None:
     assert 400 <= len(mesh.tets) <= 2500
     coarse = tetrahedralize(v, f, method=method, edge_length=0.5)
     assert len(coarse.tets) < len(mesh.tets)
+
+
+def test_nothing_is_left_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    tetrahedralize(*cube(), method="tetwild", edge_length=0.5)
+    assert not list(tmp_path.iterdir())
 
 
 def test_far_away_and_small() -> None:
