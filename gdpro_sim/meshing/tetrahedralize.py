@@ -59,7 +59,7 @@ def tetrahedralize(
 ) -> TetMesh:
     """Fill a triangle surface, vertices [V, 3] m and faces [F, 3], with tets of positive volume.
 
-    target_tets: about how many; ignored when `edge_length` (m) is given
+    target_tets: about how many, less exactly below 2500; ignored when `edge_length` (m) is given
     epsilon:     how far the tets' surface may lie from the mesh, as a share of the bounding box's diagonal
     time_limit:  seconds fTetWild may take before it is ended
     method:      "tetwild", "lattice", or "auto": fTetWild (Hu et al. 2020), and on its failure the lattice,
