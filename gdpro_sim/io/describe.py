@@ -31,7 +31,7 @@ def describe(file: str | Path) -> dict[str, Any]:
             "precision": reader.precision,
             "bytes": path.stat().st_size,
         }
-    from gdpro_sim.meshing import load_mesh
+    from gdpro_sim.meshing.load import load_mesh
 
     mesh = load_mesh(path)
     return {
