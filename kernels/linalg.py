@@ -293,9 +293,11 @@ def cg_update(
 
 @wp.kernel
 def cg_begin(
+    _start: int,
     # In:
     count: int,
     dots: wp.array[wp.float64],
+    _tolerance: wp.array[wp.float64],
     # Out:
     scalars_out: wp.array[wp.float64],
 ):
@@ -312,9 +314,11 @@ def cg_begin(
 
 @wp.kernel
 def cg_set_alpha(
+    _start: int,
     # In:
     count: int,
     dots: wp.array[wp.float64],
+    _tolerance: wp.array[wp.float64],
     # Out:
     scalars_out: wp.array[wp.float64],
 ):
@@ -330,10 +334,11 @@ def cg_set_alpha(
 
 @wp.kernel
 def cg_set_beta(
+    _start: int,
     # In:
     count: int,
-    tolerance: wp.float64,
     dots: wp.array[wp.float64],
+    tolerance: wp.array[wp.float64],
     # Out:
     scalars_out: wp.array[wp.float64],
 ):
@@ -345,5 +350,5 @@ def cg_set_beta(
         scalars_out[CG_BETA] = total / scalars_out[CG_RZ]
         scalars_out[CG_RZ] = total
         scalars_out[CG_ITERATIONS] = scalars_out[CG_ITERATIONS] + wp.float64(1.0)
-        if total <= scalars_out[CG_RZ_START] * tolerance * tolerance:
+        if total <= scalars_out[CG_RZ_START] * tolerance[0] * tolerance[0]:
             scalars_out[CG_DONE] = wp.float64(1.0)

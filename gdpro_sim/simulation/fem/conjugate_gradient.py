@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from gdpro_sim.device import launch_chunked
+from gdpro_sim.device import run_chunks
 from gdpro_sim.kernels import linalg
 from gdpro_sim.simulation.fem.topology import Topology
 
@@ -40,8 +40,8 @@ class ConjugateGradient:
         self.rows = len(topology.offsets) - 1
         self.serial = device == "cpu" and self.rows <= SERIAL_ROWS
         self.blocks = min(ROW_BLOCKS, self.rows) if device == "cpu" else self.rows
-        self.offsets = wp.array(topology.offsets, dtype=wp.int32, device=device)
-        self.columns = wp.array(topology.columns, dtype=wp.int32, device=device)
+        self.offsets: wp.array = wp.array(topology.offsets, dtype=wp.int32, device=device)
+        self.columns: wp.array = wp.array(topology.columns, dtype=wp.int32, device=device)
         self.values = wp.zeros(len(topology.columns), dtype=wp.mat33d, device=device)
         self.inverse_diagonal = wp.zeros(self.rows, dtype=wp.mat33d, device=device)
         self.right_hand_side, self.solution, self._r, self._z, self._p, self._q = (
@@ -50,6 +50,8 @@ class ConjugateGradient:
         self._dots = wp.zeros(self.blocks, dtype=wp.float64, device=device)
         self._sums = wp.zeros(ROW_BLOCKS, dtype=wp.float64, device=device)
         self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
+        self._tolerance = wp.zeros(1, dtype=wp.float64, device=device)
+        self._commands: dict[tuple[str, int, int], wp.Launch] = {}
 
     def solve(self, tolerance: float, max_iterations: int) -> SolveReport:
         """Solve until the preconditioned residual has fallen by `tolerance`, starting from zero."""
@@ -79,47 +81,66 @@ class ConjugateGradient:
         )
 
     def _solve_phases(self, tolerance: float, max_iterations: int) -> None:
-        matrix = [self.offsets, self.columns, self.values]
         self._over_rows(
             linalg.cg_reset,
             [self.right_hand_side, self.inverse_diagonal],
             [self.solution, self._r, self._z, self._p, self._dots],
         )
-        self._scalar(linalg.cg_begin, [])
+        self._scalar(linalg.cg_begin)
+        self._tolerance.fill_(tolerance)
         check_every = 1 if self.device == "cpu" else CUDA_CHECK_EVERY
         for iteration in range(max_iterations):
             if iteration % check_every == 0 and self._scalars.numpy()[linalg.CG_DONE] != 0.0:
                 break
             self._over_rows(linalg.cg_direction, [self._z, self._scalars], [self._p])
-            self._over_rows(linalg.cg_product, [*matrix, self._p], [self._q, self._dots])
-            self._scalar(linalg.cg_set_alpha, [])
+            self._over_rows(
+                linalg.cg_product,
+                [self.offsets, self.columns, self.values, self._p],
+                [self._q, self._dots],
+            )
+            self._scalar(linalg.cg_set_alpha)
             self._over_rows(
                 linalg.cg_update,
                 [self._p, self._q, self.inverse_diagonal, self._scalars],
                 [self.solution, self._r, self._z, self._dots],
             )
-            self._scalar(linalg.cg_set_beta, [tolerance])
+            self._scalar(linalg.cg_set_beta)
 
     def _over_rows(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        launch_chunked(
-            kernel,
+        arguments = [self.rows, self.blocks, *inputs]
+        if self.device != "cpu":
+            self._launch(kernel, 0, self.blocks, arguments, outputs)
+            return
+        run_chunks(
+            lambda begin, end: self._launch(kernel, begin, end, arguments, outputs),
             self.blocks,
-            [self.rows, self.blocks, *inputs],
-            outputs,
-            device=self.device,
-            minimum=ROW_BLOCKS // 16,
+            ROW_BLOCKS // 16,
         )
 
-    def _scalar(self, kernel: wp.Kernel, parameters: list[Any]) -> None:
+    def _scalar(self, kernel: wp.Kernel) -> None:
+        """One of the scalar steps, over the partial sums of the phase before it."""
         dots, count = self._dots, self.blocks
         if self.device != "cpu":
-            launch_chunked(
-                linalg.sum_ranges, ROW_BLOCKS, [count, ROW_BLOCKS, dots], [self._sums], device=self.device
-            )
+            sums = [self._sums]
+            self._launch(linalg.sum_ranges, 0, ROW_BLOCKS, [count, ROW_BLOCKS, dots], sums)
             dots, count = self._sums, ROW_BLOCKS
-        wp.launch(
-            kernel, dim=1, inputs=[count, *parameters, dots], outputs=[self._scalars], device=self.device
-        )
+        self._launch(kernel, 0, 1, [count, dots, self._tolerance], [self._scalars])
+
+    def _launch(self, kernel: wp.Kernel, begin: int, end: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch over [begin, end). The arguments of a range never change, so they are packed once."""
+        key = (kernel.key, begin, end)
+        command = self._commands.get(key)
+        if command is None:
+            command = wp.launch(
+                kernel,
+                dim=end - begin,
+                inputs=[begin, *inputs],
+                outputs=outputs,
+                device=self.device,
+                record_cmd=True,
+            )
+            self._commands[key] = command
+        command.launch()
 
     def matrix(self) -> Any:
         """A as a scipy BSR matrix (a copy), for tests and debugging."""

@@ -96,12 +96,12 @@ class IncrementalPotential:
         self._element_blocks = wp.zeros(BLOCKS_PER_ELEMENT * t, dtype=wp.mat33d, device=device)
         self._terms = wp.zeros(t + p, dtype=wp.float64, device=device)
         self._sums, self._maxima = (wp.zeros(RANGES, dtype=wp.float64, device=device) for _ in range(2))
-        self._diagonal = wp.array(topology.diagonal, dtype=wp.int32, device=device)
-        self._pairs = [
+        self._diagonal: wp.array = wp.array(topology.diagonal, dtype=wp.int32, device=device)
+        self._pairs: list[wp.array] = [
             wp.array(part, dtype=wp.int32, device=device)
             for part in (topology.pair_offsets, topology.pair_blocks)
         ]
-        self._mirrored = [
+        self._mirrored: list[wp.array] = [
             wp.array(part, dtype=wp.int32, device=device) for part in (topology.upper, topology.lower)
         ]
         self._pair_count = len(topology.upper)
