@@ -174,7 +174,7 @@ def cg_serial(
     scalars_out[CG_RZ_START] = rz
     target = rz * tolerance * tolerance
     beta = wp.float64(0.0)
-    iteration = int(0)  # noqa: UP018 (a literal would be a constant to Warp)
+    iteration = int(0)  # a bare literal would be a constant to Warp
     done = rz <= wp.float64(0.0)
     while not done and iteration < max_iterations:
         for i in range(rows):

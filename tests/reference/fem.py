@@ -1,4 +1,4 @@
-"""A plain float64 finite element oracle: linear tets, stable neo-Hookean, dense element Hessians, scipy solves.
+"""A plain float64 finite element oracle: linear tets, stable neo-Hookean, scipy solves.
 
 Written to be read, not to be fast. Formulas: Smith, de Goes & Kim 2018, eq. 13 without the logarithm, with
 Lame-corrected constants; incremental potential of backward Euler (Martin et al. 2011, eq. 3).

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
-
 from gdpro_sim.kernels import fem
+
 from gdpro_sim.simulation.fem.potential import IncrementalPotential
 from tests.reference import fem as reference
 from tests.simulation.fem_models import make_model
@@ -49,9 +51,7 @@ class Batch:
     def energies(self, x: np.ndarray, inverse_dt: float = 0.0) -> np.ndarray:
         p = self.potential
         array = wp.array(x.reshape(-1, 3), dtype=wp.vec3d, device="cpu")
-        p._over_elements(
-            fem.element_energy, [p.elements, array, p._cauchy_green, inverse_dt], [p._terms]
-        )
+        p._over_elements(fem.element_energy, [p.elements, array, p._cauchy_green, inverse_dt], [p._terms])
         return p._terms.numpy()[: len(x)].copy()
 
     def derivatives(self, x: np.ndarray, inverse_dt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +65,7 @@ class Batch:
         )
         blocks = p._element_blocks.numpy().reshape(-1, 10, 3, 3)
         full = np.zeros((len(x), 4, 3, 4, 3))
-        for slot, (a, b) in enumerate((a, b) for a in range(4) for b in range(a, 4)):
+        for slot, (a, b) in enumerate(itertools.combinations_with_replacement(range(4), 2)):
             full[:, a, :, b, :] = blocks[:, slot]
             full[:, b, :, a, :] = np.swapaxes(blocks[:, slot], 1, 2)
         return p._element_gradient.numpy().reshape(-1, 4, 3).copy(), full.reshape(-1, 12, 12)
@@ -170,7 +170,13 @@ def test_damping_hessian_at_rest_is_the_scaled_elastic_one() -> None:
 
 @pytest.mark.parametrize(
     ("stretch", "lateral", "stress"),
-    [(0.7, 1.0880, -0.3811), (0.9, 1.0304, -0.1076), (1.1, 0.9706, 0.0937), (1.5, 0.8692, 0.3832), (2.0, 0.7746, 0.6538)],
+    [
+        (0.7, 1.0880, -0.3811),
+        (0.9, 1.0304, -0.1076),
+        (1.1, 0.9706, 0.0937),
+        (1.5, 0.8692, 0.3832),
+        (2.0, 0.7746, 0.6538),
+    ],
 )
 def test_uniaxial_stretch(stretch: float, lateral: float, stress: float) -> None:
     """Known answers for poisson 0.3: lateral stretch and P_11 / E of a freely contracting bar."""

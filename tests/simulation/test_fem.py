@@ -182,10 +182,12 @@ def test_backward_euler_damping_of_a_linear_mode() -> None:
 def test_energy_never_rises_and_momentum_is_conserved_without_forces() -> None:
     vertices, tets = tet_box((3, 3, 3), (0.4, 0.4, 0.4))
     centre = vertices - 0.2
-    spin = np.cross([0.0, 0.0, 5.0], centre) + [1.0, -0.5, 0.25]
+    spin = np.cross([0.0, 0.0, 5.0], centre) + np.array([1.0, -0.5, 0.25])
     wobble = 2.0 * centre * [1.0, -1.0, 0.5]
     solver = SolverFEM(
-        make_model(vertices, tets, young=1e5, velocities=spin + wobble, gravity=(0, 0, 0), rayleigh_stiffness=1e-3)
+        make_model(
+            vertices, tets, young=1e5, velocities=spin + wobble, gravity=(0, 0, 0), rayleigh_stiffness=1e-3
+        )
     )
     start, energy = np.array(solver.diagnostics().momentum), total_energy(solver)
     for _ in range(60):
@@ -283,7 +285,7 @@ def test_surface_follows_the_embedding_and_is_exact_at_rest() -> None:
     for _ in range(6):
         solver.step(1 / 60)
     fallen = solver.positions[0, 2] - vertices[0, 2]
-    assert solver.surface_positions(0) == pytest.approx(surface + [0, 0, fallen], abs=1e-6)
+    assert solver.surface_positions(0) == pytest.approx(surface + np.array([0, 0, fallen]), abs=1e-6)
     assert solver.surface_positions(0).dtype == np.float32
 
 

@@ -114,7 +114,7 @@ def test_sliding_box_stops_where_coulomb_says() -> None:
 def test_thrown_and_spinning_box_lands() -> None:
     vertices, _ = tet_box((3, 3, 3), (SIZE,) * 3, (0, 0, 0.5))
     centre = vertices - vertices.mean(axis=0)
-    velocities = np.cross([3.0, 5.0, 1.0], centre) + [4.0, 0.0, 1.0]
+    velocities = np.cross([3.0, 5.0, 1.0], centre) + np.array([4.0, 0.0, 1.0])
     solver, _ = box_on_ground(height=0.5, young=1e5, poisson=0.45, velocities=velocities)
     run(solver, 60)
     assert solver.diagnostics().max_penetration < 1e-2 * SIZE

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from gdpro_sim.kernels import contact, elasticity, fem, linalg
 
 from gdpro_sim import device as devices
 from gdpro_sim.errors import SolverError
-from gdpro_sim.kernels import contact, elasticity, fem, linalg
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.fem.conjugate_gradient import ConjugateGradient
 from gdpro_sim.simulation.fem.potential import IncrementalPotential

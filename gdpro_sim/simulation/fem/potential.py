@@ -287,8 +287,8 @@ def _rest_shapes(model: Model) -> _RestShapes:
 def _contact_scales(model: Model, rest: _RestShapes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ground stiffness N/m, friction spring stiffness N/m and ramp depth m of each vertex.
 
-    The ground stiffness follows the vertex's own elastic stiffness (so that a stiff body indents the ground no more
-    than itself) and its body's weight (so that a soft one does not sink).
+    The ground stiffness follows the vertex's own elastic stiffness (so that a stiff body indents the ground
+    no more than itself) and its body's weight (so that a soft one does not sink).
     """
     first = -rest.inverse.sum(axis=1, keepdims=True)
     gradients = np.concatenate([first, rest.inverse], axis=1)
