@@ -51,6 +51,9 @@ class ConjugateGradient:
         self._sums = wp.zeros(ROW_BLOCKS, dtype=wp.float64, device=device)
         self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
         self._tolerance = wp.zeros(1, dtype=wp.float64, device=device)
+        if device == "cpu":
+            # Before several threads could each try to build it.
+            wp.load_module(linalg, device=device)
         self._commands: dict[tuple[str, int, int], wp.Launch] = {}
 
     def solve(self, tolerance: float, max_iterations: int) -> SolveReport:

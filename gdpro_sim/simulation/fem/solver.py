@@ -150,6 +150,8 @@ class SolverFEM:
         residual = math.inf
         for iteration in range(settings.newton_iterations):
             wp.copy(potential.base, potential.trial)
+            # Lagged friction: limits follow the iterate, then stay, so that the late iterations descend on
+            # one fixed energy.
             if iteration <= settings.newton_iterations // 2:
                 potential.update_friction(potential.base)
                 energy = potential.energy(potential.base, elements_unchanged=True)
