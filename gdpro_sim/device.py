@@ -8,10 +8,11 @@ must write memory no other index writes (plain Warp atomics are not atomic on th
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -117,6 +118,23 @@ def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1
             future.result()
 
 
+@contextlib.contextmanager
+def serial_torch() -> Iterator[None]:
+    """Run torch's own CPU operators on one thread inside the block.
+
+    Their worker threads spin while they wait and stall behind ours on a busy machine (with one other process
+    running a picture took 740 ms instead of 200), and sums no longer depend on the number of cores.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def launch_chunked(
     kernel: wp.Kernel,
     count: int,
@@ -141,4 +159,11 @@ def launch_chunked(
     run_chunks(launch, count, minimum)
 
 
-__all__ = ["launch_chunked", "resolve_device", "run_chunks", "set_thread_count", "thread_count"]
+__all__ = [
+    "launch_chunked",
+    "resolve_device",
+    "run_chunks",
+    "serial_torch",
+    "set_thread_count",
+    "thread_count",
+]

@@ -2,12 +2,11 @@
 
 The triangle's affine map F takes the rest edges to the moved edges and the rest unit normal to the moved unit
 normal, so the covariance F S F^T splits exactly into the normal axis (unchanged) and an in-plane 2 x 2 part.
-With the in-plane factor M = G R(phi) diag(s), one one-sided Jacobi rotation makes the columns of M orthogonal:
+With the in-plane factor M = G R(phi) diag(s), one Jacobi rotation makes the columns of M orthogonal:
 their lengths are the new scales, their directions the new axes, and axis order never jumps between frames.
 """
 
 import warp as wp
-
 from gdpro_sim.kernels.harmonics import harmonics_sum
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
@@ -17,12 +16,12 @@ TINY = wp.constant(1e-30)
 
 @wp.struct
 class TriangleFrame:
-    """Orthonormal frame (normal, along the first edge, completing) and the 2D corners (l, 0), (p, q)."""
+    """Orthonormal frame (normal, along the first edge, completing) and the 2D corners (edge, 0), (p, q)."""
 
     normal: wp.vec3
     e1: wp.vec3
     e2: wp.vec3
-    l: float
+    edge: float
     p: float
     q: float
 
@@ -32,10 +31,10 @@ def triangle_frame(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> TriangleFrame:
     frame = TriangleFrame()
     ab = b - a
     ac = c - a
-    frame.l = wp.length(ab)
+    frame.edge = wp.length(ab)
     frame.e1 = wp.vec3(1.0, 0.0, 0.0)
-    if frame.l > TINY:
-        frame.e1 = ab / frame.l
+    if frame.edge > TINY:
+        frame.e1 = ab / frame.edge
     cross = wp.cross(frame.e1, ac)
     frame.q = wp.length(cross)
     if frame.q > TINY:
@@ -86,7 +85,9 @@ def turned(d: wp.vec3, rest: TriangleFrame, moved: TriangleFrame, cos: float, si
     """R^T d, with R the rotation part of F: frame to frame, and the polar angle of G in the plane."""
     u = wp.dot(d, moved.e1)
     v = wp.dot(d, moved.e2)
-    return rest.normal * wp.dot(d, moved.normal) + rest.e1 * (cos * u + sin * v) + rest.e2 * (cos * v - sin * u)
+    return (
+        rest.normal * wp.dot(d, moved.normal) + rest.e1 * (cos * u + sin * v) + rest.e2 * (cos * v - sin * u)
+    )
 
 
 @wp.kernel
@@ -140,16 +141,16 @@ def follow_triangles(
     at_rest = same(a, ra) and same(b, rb) and same(c, rc)
     if not at_rest:
         rest = triangle_frame(ra, rb, rc)
-        l = wp.max(rest.l, TINY)
+        edge = wp.max(rest.edge, TINY)
         q = wp.max(rest.q, TINY)
-        g11 = moved.l / l
+        g11 = moved.edge / edge
         g22 = moved.q / q
         g12 = (moved.p - rest.p * g11) / q
         ax = (g11 * x + g12 * y) * s1
         ay = g22 * y * s1
         bx = (g12 * x - g11 * y) * s2
         by = g22 * x * s2
-        # One-sided Jacobi (Hestenes 1958): the smaller rotation that makes the two columns orthogonal.
+        # One-sided Jacobi (Hestenes 1958): the smaller rotation that makes the columns orthogonal.
         dot = ax * bx + ay * by
         aa = ax * ax + ay * ay
         bb = bx * bx + by * by

@@ -39,9 +39,6 @@ through."""
 SLIVER = 0.12
 """Least area over the squared longest edge that counts, 0.43 for an equilateral triangle."""
 
-SKY = (-0.4, -0.55, 0.75)
-"""Direction of the light baked into plain meshes."""
-
 DENSE, DECIMATED = 0.3, 0.2
 """A mesh of more than DENSE * budget faces is decimated to DECIMATED * budget."""
 
@@ -143,22 +140,22 @@ class _Surface:
 
 
 def bind_mesh(
-    mesh: SurfaceMesh, *, budget: int = 50_000, seed: int = 0, shading: float = 0.6
+    mesh: SurfaceMesh, *, budget: int = 50_000, seed: int = 0, occlusion: float = 0.35
 ) -> BoundGaussians:
     """Bind about `budget` Gaussians to a mesh: within 15 % of it where the mesh allows, never above 1.2
     times.
 
     A dense mesh is decimated and a coarse one subdivided first, so `vertices` and `faces` of the result need
     not be the mesh's. Colours are sampled on the mesh as given. SH degree 0. The same arguments give the same
-    bytes. Splats carry no light, so a mesh of one plain colour would be a silhouette: `shading` (0 for none)
-    is the share of a soft light from above, ambient occlusion included, baked into such a mesh's Gaussians.
+    bytes. Splats carry no light, so a mesh of one plain colour would be a silhouette elsewhere: `occlusion`
+    (0 for none) is how much of the light its hollows lose.
     Raises `MeshError` for a budget below 100, or one too small for a mesh that cannot be decimated
     enough.
     """
     if budget < MIN_BUDGET:
         raise MeshError(f"Gaussian budget must be >= {MIN_BUDGET}, got {budget}")
-    if not 0.0 <= shading <= 1.0:
-        raise MeshError(f"shading must lie in 0..1, got {shading}")
+    if not 0.0 <= occlusion <= 1.0:
+        raise MeshError(f"occlusion must lie in 0..1, got {occlusion}")
     surface = _triangles(mesh, budget)
     v, f = surface.vertices.astype(np.float64), surface.faces
     if len(f) > 1.2 * budget:
@@ -181,9 +178,9 @@ def bind_mesh(
     rgba = _patch_colors(
         mesh, surface, face_ids, weights, per_face[face_ids], areas[face_ids] / per_face[face_ids]
     )
-    if shading > 0.0 and _plain(mesh):
-        light = _vertex_light(v, f)
-        rgba[:, :3] *= 1.0 - shading * (1.0 - np.einsum("nc,nc->n", weights, light[f[face_ids]])[:, None])
+    if occlusion > 0.0 and _plain(mesh):
+        light = _vertex_openness(v, f)
+        rgba[:, :3] *= 1.0 - occlusion * (1.0 - np.einsum("nc,nc->n", weights, light[f[face_ids]])[:, None])
     opacity = np.clip(OPACITY * rgba[:, 3], 0.005, OPACITY)
     return BoundGaussians(
         vertices=torch.from_numpy(np.ascontiguousarray(surface.vertices, np.float32)),
@@ -316,13 +313,11 @@ def _plain(mesh: SurfaceMesh) -> bool:
     return not textured and mesh.colors is None and len(used) == 1
 
 
-def _vertex_light(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Soft light in [0, 1] at each vertex, float64 [V]: a bright sky from above left, shut out by what is
-    near."""
+def _vertex_openness(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Share in [0, 1] of the surroundings that each vertex sees past what is near, [V]."""
     normals = _unit(_vertex_sums(face_normals(vertices, faces), faces, len(vertices)))
-    sky = 0.5 + 0.5 * normals @ (np.asarray(SKY) / np.linalg.norm(SKY))
     reach = 0.3 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    return sky * SurfaceIndex(vertices, faces).openness(vertices, normals, reach=reach)
+    return SurfaceIndex(vertices, faces).openness(vertices, normals, reach=reach)
 
 
 def _vertex_sums(values: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:

@@ -23,6 +23,7 @@ import torch
 import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.cameras import Cameras
+from gdpro_sim.device import serial_torch
 from gdpro_sim.errors import OutputError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
 from gdpro_sim.io.images import read_png, spread, write_contact_sheet, write_png, write_video
@@ -65,6 +66,7 @@ class Recording:
         return {**data, "assets": [str(path) for path in self.assets]}
 
 
+@serial_torch()
 def record(
     scene: Scene | str | Path,
     output: str | Path,

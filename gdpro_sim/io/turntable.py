@@ -11,7 +11,7 @@ import torch
 
 from gdpro_sim.asset import Asset, kind
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.device import resolve_device
+from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import RequestError
 from gdpro_sim.files import prepare_folder
 from gdpro_sim.io.images import write_png
@@ -20,6 +20,7 @@ from gdpro_sim.io.usd import SimulationReader
 from gdpro_sim.simulation.frame import Frame
 
 
+@serial_torch()
 def render_file(
     file: str | Path,
     output: str | Path,

@@ -96,8 +96,8 @@ def test_bad_requests_are_refused() -> None:
     mesh = SurfaceMesh.from_arrays(*cube())
     with pytest.raises(MeshError, match="budget must be >= 100, got 7"):
         bind_mesh(mesh, budget=7)
-    with pytest.raises(MeshError, match="shading"):
-        bind_mesh(mesh, shading=2.0)
+    with pytest.raises(MeshError, match="occlusion"):
+        bind_mesh(mesh, occlusion=2.0)
 
 
 def coverage(bound: BoundGaussians, samples: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -213,12 +213,19 @@ def test_thin_walls_keep_their_own_side() -> None:
     assert ((rgb[inner, 0] > 0.5) == (points[inner, 2] > 0.001)).all()
 
 
-def test_plain_meshes_carry_soft_light_and_can_do_without() -> None:
-    mesh = SurfaceMesh.from_arrays(*sphere(3), color=(0.5, 0.5, 0.5))
-    lit = bind_mesh(mesh, budget=2000)
-    height, red = points_of(lit)[:, 2], sh_to_rgb(lit.sh[:, 0, 0]).numpy()
-    assert red[height > 0.7].mean() > red[height < -0.7].mean() + 0.1 and red.max() <= 0.5
-    flat = sh_to_rgb(bind_mesh(mesh, budget=2000, shading=0.0).sh[:, 0]).numpy()
+def test_plain_meshes_are_darker_in_their_hollows_only() -> None:
+    grey = (0.5, 0.5, 0.5)
+    ball = sh_to_rgb(bind_mesh(SurfaceMesh.from_arrays(*sphere(3), color=grey), budget=2000).sh[:, 0]).numpy()
+    assert np.allclose(ball, 0.5, atol=1e-6), "nothing shades a convex body"
+    v, f = sphere(3)
+    low = v.copy()
+    low[:, 2] -= 2.05  # two balls that nearly touch shade each other there
+    pair = SurfaceMesh.from_arrays(np.concatenate([v, low]), np.concatenate([f, f + len(v)]), color=grey)
+    bound = bind_mesh(pair, budget=4000)
+    height, red = points_of(bound)[:, 2], sh_to_rgb(bound.sh[:, 0, 0]).numpy()
+    gap = np.abs(height + 1.025) < 0.08
+    assert red[gap].mean() < 0.45 and red[height > 0.8].mean() > 0.49
+    flat = sh_to_rgb(bind_mesh(pair, budget=4000, occlusion=0.0).sh[:, 0]).numpy()
     assert np.allclose(flat, 0.5, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Readable float64 oracle of `BoundGaussians.gaussians`: the triangle's 3 x 3 affine map, one Gaussian at a time."""
+"""Readable float64 oracle of `BoundGaussians.gaussians`: each triangle's 3 x 3 affine map in turn."""
 
 from __future__ import annotations
 
