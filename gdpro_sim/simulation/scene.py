@@ -120,8 +120,9 @@ class SolverOptions(_Strict):
 
     kind: Literal["fem"] = "fem"
     substeps: int = Field(default=2, ge=1, le=1000, description="implicit steps per frame at least")
-    newton_iterations: int = Field(default=8, ge=1, le=1000, description="at most, per substep")
+    newton_iterations: int = Field(default=20, ge=1, le=1000, description="at most, per substep")
     newton_tolerance: float = Field(default=1e-3, gt=0.0, description="largest vertex speed correction, m/s")
+    cg_iterations: int = Field(default=2000, ge=1, description="at most, per Newton iteration")
     cg_tolerance: float = Field(
         default=1e-2, gt=0.0, lt=1.0, description="relative residual of inner conjugate gradients"
     )
