@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from gdpro_sim.device import launch_chunked
+from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.errors import AssetError
 from gdpro_sim.gaussians import SH_C0, Gaussians
 from gdpro_sim.kernels.binding import follow_triangles
@@ -85,34 +85,35 @@ class BoundGaussians:
         degree = math.isqrt(self.sh.shape[1]) - 1 if rotate_sh else 0
         sh = torch.empty_like(self.sh) if degree > 0 else self.sh
         if n > 0:
-            name = "cpu" if device.type == "cpu" else str(wp.device_from_torch(device))
+            name = device_name(moved)
             directions, inverse = _sh_rotation_tables(degree, name)
             rest_sh = wp.from_torch(self.sh.detach().contiguous(), dtype=wp.vec3)
-            launch_chunked(
-                follow_triangles,
-                n,
-                [
-                    wp.from_torch(self.vertices.detach().contiguous(), dtype=wp.vec3),
-                    wp.from_torch(moved, dtype=wp.vec3),
-                    wp.from_torch(self.faces.contiguous()),
-                    wp.from_torch(self.face_ids.contiguous()),
-                    wp.from_torch(self.barycentrics.contiguous(), dtype=wp.vec3),
-                    wp.from_torch(self.rotations.detach().contiguous(), dtype=wp.vec2),
-                    wp.from_torch(self.log_scales.detach().contiguous(), dtype=wp.vec3),
-                    rest_sh,
-                    directions,
-                    inverse,
-                    degree,
-                ],
-                [
-                    wp.from_torch(means, dtype=wp.vec3),
-                    wp.from_torch(quats, dtype=wp.vec4),
-                    wp.from_torch(scales, dtype=wp.vec3),
-                    wp.from_torch(sh, dtype=wp.vec3) if degree > 0 else rest_sh,
-                ],
-                device=name,
-                minimum=4096,
-            )
+            with torch_stream(moved):
+                launch_chunked(
+                    follow_triangles,
+                    n,
+                    [
+                        wp.from_torch(self.vertices.detach().contiguous(), dtype=wp.vec3),
+                        wp.from_torch(moved, dtype=wp.vec3),
+                        wp.from_torch(self.faces.contiguous()),
+                        wp.from_torch(self.face_ids.contiguous()),
+                        wp.from_torch(self.barycentrics.contiguous(), dtype=wp.vec3),
+                        wp.from_torch(self.rotations.detach().contiguous(), dtype=wp.vec2),
+                        wp.from_torch(self.log_scales.detach().contiguous(), dtype=wp.vec3),
+                        rest_sh,
+                        directions,
+                        inverse,
+                        degree,
+                    ],
+                    [
+                        wp.from_torch(means, dtype=wp.vec3),
+                        wp.from_torch(quats, dtype=wp.vec4),
+                        wp.from_torch(scales, dtype=wp.vec3),
+                        wp.from_torch(sh, dtype=wp.vec3) if degree > 0 else rest_sh,
+                    ],
+                    device=name,
+                    minimum=4096,
+                )
         return Gaussians(means, quats, scales, torch.sigmoid(self.opacity_logits.detach()), sh.detach())
 
     def normals(self, vertices: torch.Tensor | None = None) -> torch.Tensor:

@@ -14,11 +14,14 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from gdpro_sim.errors import DeviceError
+
+if TYPE_CHECKING:
+    import torch
 
 wp.config.log_level = wp.LOG_WARNING
 
@@ -118,6 +121,24 @@ def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1
             future.result()
 
 
+def device_name(tensor: torch.Tensor) -> str:
+    """Warp's name of the device a tensor lies on. Raises DeviceError where Warp has no such device."""
+    if tensor.device.type == "cpu":
+        return "cpu"
+    if tensor.device.type != "cuda":
+        raise DeviceError(f"tensors must lie on a CPU or a CUDA device, got {tensor.device}")
+    return str(wp.device_from_torch(tensor.device))
+
+
+def torch_stream(tensor: torch.Tensor) -> contextlib.AbstractContextManager[object]:
+    """Run Warp's work on torch's current CUDA stream, so neither has to wait for the other."""
+    if device_name(tensor) == "cpu":
+        return contextlib.nullcontext()
+    import torch
+
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
+
+
 @contextlib.contextmanager
 def serial_torch() -> Iterator[None]:
     """Run torch's own CPU operators on one thread inside the block.
@@ -160,10 +181,12 @@ def launch_chunked(
 
 
 __all__ = [
+    "device_name",
     "launch_chunked",
     "resolve_device",
     "run_chunks",
     "serial_torch",
     "set_thread_count",
     "thread_count",
+    "torch_stream",
 ]

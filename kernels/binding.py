@@ -7,6 +7,7 @@ their lengths are the new scales, their directions the new axes, and axis order 
 """
 
 import warp as wp
+
 from gdpro_sim.kernels.harmonics import harmonics_sum
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})

@@ -14,6 +14,7 @@ Up to four channels are blended at once; more channels run again over the same l
 """
 
 import warp as wp
+
 from gdpro_sim.kernels.projection import BOX, FACTOR, LOG2_CUTOFF, LOG2_OPACITY, MEAN, REACH, RECORD, TILE
 
 wp.set_module_options(

@@ -13,6 +13,7 @@ fixed order. F = sum_a x_a (x) grad N_a with constant gradients, the rows of the
 from __future__ import annotations
 
 import warp as wp
+
 from gdpro_sim.kernels.contact import (
     friction_anchor,
     friction_energy,

@@ -17,6 +17,7 @@ Culled Gaussians have a record of zeros, an empty rectangle and an infinite sort
 """
 
 import warp as wp
+
 from gdpro_sim.kernels.harmonics import harmonics_sum
 
 wp.set_module_options(

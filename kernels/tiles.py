@@ -10,6 +10,7 @@ Tiles are numbered row by row, camera after camera.
 """
 
 import warp as wp
+
 from gdpro_sim.kernels.projection import vec4s
 
 wp.set_module_options(

@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.device import launch_chunked
+from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.gaussians import SH_C0, Gaussians
 from gdpro_sim.kernels.shading import gather_light
 from gdpro_sim.splatting import rasterization
@@ -92,28 +92,28 @@ class _ShadowMaps:
     def gather(self, points: torch.Tensor, normals: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Light of the key and of the sky, and the key's visibility, at points and unit normals [M, 3]."""
         device = points.device
-        name = "cpu" if device.type == "cpu" else str(wp.device_from_torch(device))
         light = torch.empty((len(points), 3), dtype=torch.float32, device=device)
-        launch_chunked(
-            gather_light,
-            len(points),
-            [
-                wp.from_torch(points.contiguous(), dtype=wp.vec3),
-                wp.from_torch(normals.contiguous(), dtype=wp.vec3),
-                wp.from_torch(self.alpha.contiguous()),
-                wp.from_torch(self.depth.contiguous()),
-                wp.from_torch(self.cameras.viewmats.to(device).contiguous(), dtype=wp.mat44),
-                float(self.cameras.Ks[0, 0, 0]),
-                wp.from_torch(self.directions, dtype=wp.vec3),
-                wp.from_torch(self.weights),
-                KEY_LIGHTS,
-                self.bias,
-                self.softness,
-            ],
-            [wp.from_torch(light, dtype=wp.vec3)],
-            device=name,
-            minimum=2048,
-        )
+        with torch_stream(points):
+            launch_chunked(
+                gather_light,
+                len(points),
+                [
+                    wp.from_torch(points.contiguous(), dtype=wp.vec3),
+                    wp.from_torch(normals.contiguous(), dtype=wp.vec3),
+                    wp.from_torch(self.alpha.contiguous()),
+                    wp.from_torch(self.depth.contiguous()),
+                    wp.from_torch(self.cameras.viewmats.to(device).contiguous(), dtype=wp.mat44),
+                    float(self.cameras.Ks[0, 0, 0]),
+                    wp.from_torch(self.directions, dtype=wp.vec3),
+                    wp.from_torch(self.weights),
+                    KEY_LIGHTS,
+                    self.bias,
+                    self.softness,
+                ],
+                [wp.from_torch(light, dtype=wp.vec3)],
+                device=device_name(points),
+                minimum=2048,
+            )
         return light.unbind(1)
 
 

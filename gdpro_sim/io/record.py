@@ -12,7 +12,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,13 @@ import torch
 import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.device import serial_torch
+from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import OutputError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
 from gdpro_sim.io.images import read_png, spread, write_contact_sheet, write_png, write_video
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.usd import SimulationWriter, body_records
-from gdpro_sim.simulation.compile import load_assets
+from gdpro_sim.simulation.compile import check_files, load_assets
 from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.model import Diagnostics
 from gdpro_sim.simulation.run import Simulation
@@ -82,6 +82,8 @@ def record(
     finished frames stay on disk and the next call continues after them.
     """
     checked = scene if isinstance(scene, Scene) else load_scene(scene)
+    check_files(checked)
+    resolve_device(device)
     folder = prepare_folder(output, "simulation.usdc")
     frames = prepare_folder(folder / "frames", _frame_name(0))
     remove_stale(folder)
@@ -95,7 +97,7 @@ def record(
     names = [body.name for body in checked.bodies]
     asset_paths = [folder / ("asset.usdc" if len(names) == 1 else f"asset_{name}.usdc") for name in names]
     kept = dict(zip(names, asset_paths, strict=True)) if store.has_assets(asset_paths) else None
-    assets = load_assets(checked, stored=kept)
+    assets = load_assets(checked, stored=kept, on_progress=lambda phase: report(phase, 0, 0))
     if kept is None:
         _save_assets(assets, names, asset_paths)
         store.assets_saved(asset_paths)
@@ -108,13 +110,11 @@ def record(
     begin = time.perf_counter()
     pictures = [frames / _frame_name(i) for i in range(len(simulation))]
     _remove_later_frames(frames, len(simulation))
-    report("video", 0, 0)
-    write_video(folder / "preview.mp4", (read_png(p) for p in pictures), checked.fps)
+    write_video(folder / "preview.mp4", _read_all(pictures, report), checked.fps)
     chosen = spread(len(pictures), 12)
     labels = [f"t = {i / checked.fps:.2f} s" for i in chosen]
     write_contact_sheet(folder / "contact_sheet.png", [read_png(pictures[i]) for i in chosen], labels)
     _write_metrics(folder / "metrics.csv", rows)
-    report("video", 1, 1)
     seconds.update(
         {phase: sum(row[f"ms_{phase}"] for row in rows[store.resumed :]) / 1e3 for phase in PHASES}
     )
@@ -201,6 +201,12 @@ def _normals(simulation: Simulation, frame: Frame) -> torch.Tensor:
             for body, moved in zip(simulation.model.bodies, frame.bodies, strict=True)
         ]
     )
+
+
+def _read_all(pictures: list[Path], report: Progress) -> Iterator[np.ndarray]:
+    for done, path in enumerate(pictures):
+        report("video", done, len(pictures))
+        yield read_png(path)
 
 
 def _frame_name(index: int) -> str:

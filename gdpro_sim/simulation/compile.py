@@ -21,6 +21,16 @@ logger = logging.getLogger(__name__)
 FALLBACK_MATERIAL = "jelly"
 
 
+def check_files(scene: Scene) -> None:
+    """Raise SceneError for the first file a scene names that does not exist."""
+    for body in scene.bodies:
+        for key in ("asset", "texture"):
+            reference = getattr(body, key)
+            if reference is not None and not scene.resolve(reference).exists():
+                path = scene.resolve(reference)
+                raise SceneError(f"{scene.name}: bodies[{body.name}].{key}: {path}: no such file")
+
+
 def load_assets(
     scene: Scene,
     *,
@@ -32,16 +42,15 @@ def load_assets(
     `stored` names asset files of an earlier run of the same scene: they are taken as they are, because
     tetrahedralization is not repeatable. Raises MeshError, AssetError or SceneError.
     """
+    check_files(scene)
+    tell = on_progress or (lambda phase: None)
     assets: dict[str, Asset] = {}
     for body in scene.bodies:
         if stored and body.name in stored:
             assets[body.name] = Asset.load(stored[body.name])
             continue
         path = scene.resolve(body.asset)
-        if not path.exists():
-            raise SceneError(f"{scene.name}: bodies[{body.name}].asset: {path}: no such file")
-        if on_progress:
-            on_progress(f"preparing {body.name}")
+        tell(f"preparing {body.name}")
         if kind(path) == "asset":
             ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
             if ignored:
@@ -60,10 +69,11 @@ def load_assets(
                 up=body.up,
                 tets=False,
                 seed=scene.seed,
+                on_progress=tell,
             )
         if asset.tets is None:
             # At the asset's own size: the caller may place several bodies of one asset at several sizes.
-            asset = tetrahedralize_asset(asset, target_tets=body.tets)
+            asset = tetrahedralize_asset(asset, target_tets=body.tets, on_progress=tell)
         if asset.material is None or body.material is not None:
             asset = replace(asset, material=_material(body, asset))
         assets[body.name] = asset
@@ -176,4 +186,4 @@ def _pinned(scene: Scene, body: SceneBody, vertices: np.ndarray) -> np.ndarray:
     return inside
 
 
-__all__ = ["compile_scene", "load_assets"]
+__all__ = ["check_files", "compile_scene", "load_assets"]

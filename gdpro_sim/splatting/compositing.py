@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from gdpro_sim.device import launch_chunked, run_chunks, thread_count
+from gdpro_sim.device import device_name, launch_chunked, run_chunks, thread_count
 from gdpro_sim.kernels import compositing as kernels
 from gdpro_sim.kernels.projection import CHANNELS
-from gdpro_sim.splatting.projection import Projection, View, array, device_name, pack_channels
+from gdpro_sim.splatting.projection import Projection, View, array, pack_channels
 from gdpro_sim.splatting.tiles import TileLists
 
 GROUP = 4

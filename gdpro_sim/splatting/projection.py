@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import launch_chunked
+from gdpro_sim.device import device_name, launch_chunked
 from gdpro_sim.kernels import projection as kernels
 from gdpro_sim.kernels.projection import vec4s
 
@@ -82,12 +82,6 @@ def array(tensor: torch.Tensor, dtype: type) -> Any:
     It does not keep the tensor alive.
     """
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
-
-
-def device_name(tensor: torch.Tensor) -> str:
-    """Warp's name of the tensor's device; starts Warp where it is not yet running."""
-    wp.init()
-    return str(wp.device_from_torch(tensor.device))
 
 
 def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int = 32) -> None:
@@ -195,7 +189,6 @@ __all__ = [
     "Projection",
     "View",
     "array",
-    "device_name",
     "pack_channels",
     "project",
     "shade_features",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-import warp as wp
 
+from gdpro_sim.device import torch_stream
 from gdpro_sim.splatting.checks import (
     INDEX_LIMIT,
     check_choice,
@@ -21,7 +20,6 @@ from gdpro_sim.splatting.compositing import Composite, composite
 from gdpro_sim.splatting.projection import (
     Projection,
     View,
-    device_name,
     project,
     shade_features,
     shade_harmonics,
@@ -160,7 +158,7 @@ def rasterization(
         )
 
     drawn = colors if with_colors else means.new_empty((count, 0))
-    with _torch_stream(means):
+    with torch_stream(means):
         projection, lists, result = _render(
             (means, quats, scales, opacities),
             drawn,
@@ -222,14 +220,6 @@ def _render(
             shade_features(projection, flat)
         lists = (count_and_fill if tile else expand_and_sort)(projection, view, limit)
     return projection, lists, composite(projection, lists, flat, background, divided, view, tile=tile)
-
-
-def _torch_stream(tensor: torch.Tensor) -> AbstractContextManager[object]:
-    """Run Warp's work on torch's current CUDA stream, so neither has to wait for the other."""
-    if tensor.device.type == "cpu":
-        return nullcontext()
-    device_name(tensor)
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
 
 
 def _check_colors(

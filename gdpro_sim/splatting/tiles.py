@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from gdpro_sim.device import launch_chunked, thread_count
+from gdpro_sim.device import device_name, launch_chunked, thread_count
 from gdpro_sim.kernels import tiles as kernels
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting.checks import INDEX_LIMIT, check_count
-from gdpro_sim.splatting.projection import Projection, View, array, device_name, sort_pairs
+from gdpro_sim.splatting.projection import Projection, View, array, sort_pairs
 
 PART = 4096
 """Fewest Gaussians worth a part (and so a thread) of the counting sort."""

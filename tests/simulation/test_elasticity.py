@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
-from gdpro_sim.kernels import fem
 
+from gdpro_sim.kernels import fem
 from gdpro_sim.simulation.fem.potential import IncrementalPotential
 from tests.reference import fem as reference
 from tests.simulation.fem_models import make_model

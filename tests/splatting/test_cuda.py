@@ -1,29 +1,12 @@
-"""The CUDA path: it compiles everywhere, and gives the CPU's image where there is a GPU."""
+"""The CUDA path gives the CPU's image, where there is a GPU."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-import warp as wp
-from gdpro_sim.kernels import compositing, projection, tiles
 
 from gdpro_sim.splatting import rasterization
 from tests.splatting.scenes import cameras, cloud, features, harmonics
-
-
-@pytest.mark.parametrize(
-    "module", [projection, tiles, compositing], ids=lambda m: m.__name__.rsplit(".", 1)[1]
-)
-def test_kernels_compile_for_cuda_without_a_gpu(module: object, tmp_path: Path) -> None:
-    wp.init()
-    wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
-    built = list(tmp_path.glob("*.ptx"))
-    assert len(built) == 1
-    text = built[0].read_text()
-    for kernel in wp.get_module(module.__name__).kernels.values():
-        assert f"{kernel.key}_" in text
 
 
 @pytest.mark.cuda
