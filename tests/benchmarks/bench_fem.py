@@ -9,10 +9,7 @@ no damping, default solver settings. The first step (compilation) is not counted
 from __future__ import annotations
 
 import argparse
-import os
-import platform
 import time
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -20,22 +17,8 @@ import warp as wp
 from gdpro_sim import device as devices
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.model import Ground
+from tests.benchmarks.machine import machine
 from tests.simulation.fem_models import make_model, tet_box
-
-
-def machine() -> str:
-    """One line on the processor, cores, load and versions."""
-    name = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        lines = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
-        name = lines[0].split(":", 1)[1].strip() if lines else name
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
-    return (
-        f"{name}, {os.cpu_count()} cores, {devices.thread_count()} threads used, "
-        f"load before the run {load:.1f}, "
-        f"Python {platform.python_version()}, Warp {wp.config.version}"
-    )
 
 
 def measure(cells: int, young: float, frames: int, device: str) -> str:
@@ -75,7 +58,7 @@ def main() -> None:
         devices.set_thread_count(options.threads)
     device = devices.resolve_device(options.device)
 
-    print(f"{time.strftime('%Y-%m-%d')}, {device}: {machine()}\n")
+    print(f"{machine(device)}\n")
     print(
         "| tets | E, Pa | ms/frame mean | median | worst "
         "| substeps | Newton/frame | CG/Newton | unconverged |"
