@@ -33,7 +33,7 @@ from gdpro_sim.simulation.compile import check_files, load_assets
 from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.model import Diagnostics
 from gdpro_sim.simulation.run import Simulation
-from gdpro_sim.simulation.scene import Scene, load_scene
+from gdpro_sim.simulation.scene import Scene, SceneBody, load_scene
 
 logger = logging.getLogger(__name__)
 
@@ -248,23 +248,41 @@ def _remove_later_frames(frames: Path, count: int) -> None:
 
 
 def _camera(scene: Scene, simulation: Simulation) -> Cameras:
-    """The scene's camera; what it leaves out is chosen so that bodies, fall and landing fit the picture."""
-    surfaces = [body.surface for body in simulation.model.bodies]
-    low = np.min([s.min(axis=0) for s in surfaces], axis=0).astype(float)
-    high = np.max([s.max(axis=0) for s in surfaces], axis=0).astype(float)
+    """The scene's camera; what it leaves out is chosen so that flight, landing and slide fit the picture."""
+    boxes = []
+    for body, placed in zip(scene.bodies, simulation.model.bodies, strict=True):
+        low, high = placed.surface.min(axis=0).astype(float), placed.surface.max(axis=0).astype(float)
+        friction = float(simulation.model.friction[placed.vertex_range[0]])
+        for shift in _path(scene, body, low, float((high - low).max()), friction):
+            boxes.append((low + shift, high + shift))
+    low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
     if scene.ground is not None:
-        drop = max(0.0, float(low[2]) - scene.ground.height)
-        flight = min(scene.duration, (2.0 * drop / 9.81) ** 0.5)
-        for body in scene.bodies:
-            reach = flight * np.asarray(body.velocity)[:2]
-            low[:2] = np.minimum(low[:2], low[:2] + reach)
-            high[:2] = np.maximum(high[:2], high[:2] + reach)
-        low[2] = scene.ground.height
+        low[2] = min(low[2], scene.ground.height)
         spread_out = 0.12 * (high[:2] - low[:2])
         low[:2] -= spread_out
         high[:2] += spread_out
-    camera = scene.camera
-    return frame_camera(low, high, **camera.model_dump())
+    return frame_camera(low, high, **scene.camera.model_dump())
+
+
+def _path(scene: Scene, body: SceneBody, low: np.ndarray, size: float, friction: float) -> list[np.ndarray]:
+    """Where a body is likely to go, as shifts of its box: a throw, then a slide that friction ends."""
+    if body.pins is not None:
+        return [np.zeros(3), np.array([0.0, 0.0, -0.3 * size])]
+    shifts: list[np.ndarray] = []
+    velocity, gravity = np.asarray(body.velocity), np.asarray(scene.gravity)
+    for t in np.linspace(0.0, scene.duration, 60):
+        shift = velocity * t + 0.5 * gravity * t * t
+        if scene.ground is None:
+            shift = np.clip(shift, -2.0 * size, 2.0 * size)
+        elif low[2] + shift[2] < scene.ground.height:
+            speed = float(np.linalg.norm(velocity[:2]))
+            brake = max(friction * abs(float(gravity[2])), 1e-6)
+            slide = min(speed / (2.0 * brake), scene.duration - t)
+            shift[:2] += velocity[:2] * slide
+            shift[2] = scene.ground.height - low[2]
+            return [*shifts, shift]
+        shifts.append(shift)
+    return shifts
 
 
 def _studio(scene: Scene, simulation: Simulation) -> Studio:
