@@ -15,7 +15,11 @@ _PUBLIC = {
     "BoundGaussians": "gdpro_sim.binding",
     "Cameras": "gdpro_sim.cameras",
     "Gaussians": "gdpro_sim.gaussians",
+    "Frame": "gdpro_sim.simulation.frame",
     "GdproError": "gdpro_sim.errors",
+    "Material": "gdpro_sim.materials",
+    "RasterOptions": "gdpro_sim.splatting",
+    "Simulation": "gdpro_sim.simulation.run",
     "Scene": "gdpro_sim.simulation.scene",
     "import_mesh": "gdpro_sim.asset",
     "load_scene": "gdpro_sim.simulation.scene",
@@ -31,9 +35,11 @@ if TYPE_CHECKING:
     from gdpro_sim.errors import GdproError
     from gdpro_sim.gaussians import Gaussians
     from gdpro_sim.io.record import record
-    from gdpro_sim.simulation.run import simulate
+    from gdpro_sim.materials import Material
+    from gdpro_sim.simulation.frame import Frame
+    from gdpro_sim.simulation.run import Simulation, simulate
     from gdpro_sim.simulation.scene import Scene, load_scene
-    from gdpro_sim.splatting import rasterization
+    from gdpro_sim.splatting import RasterOptions, rasterization
 
 
 def __getattr__(name: str) -> Any:
@@ -52,9 +58,13 @@ __all__ = [
     "Asset",
     "BoundGaussians",
     "Cameras",
+    "Frame",
     "Gaussians",
     "GdproError",
+    "Material",
+    "RasterOptions",
     "Scene",
+    "Simulation",
     "import_mesh",
     "load_scene",
     "rasterization",

@@ -38,7 +38,8 @@ class Cameras:
     ) -> Cameras:
         """Cameras at `eyes` [C, 3] m looking at `targets` [C, 3] or [3] m; `vertical_fov` in radians.
 
-        Raises ValueError where an eye coincides with its target. A view along `up` uses +Y as up instead.
+        Raises ValueError where an eye coincides with its target. A view along `up` takes the world axis most
+        across it as up.
         """
         eye = np.atleast_2d(np.asarray(eyes, dtype=np.float64))
         target = np.broadcast_to(np.atleast_2d(np.asarray(targets, dtype=np.float64)), eye.shape)
@@ -49,7 +50,7 @@ class Cameras:
         forward = forward / distance
         ups = np.broadcast_to(np.asarray(up, dtype=np.float64), eye.shape).copy()
         parallel = np.linalg.norm(np.cross(forward, ups), axis=1) < 1e-6
-        ups[parallel] = (0.0, 1.0, 0.0)
+        ups[parallel] = np.eye(3)[np.abs(forward[parallel]).argmin(axis=1)]
         right = np.cross(forward, ups)
         right /= np.linalg.norm(right, axis=1, keepdims=True)
         down = np.cross(forward, right)

@@ -228,7 +228,7 @@ def render(
     _setup(quiet, debug)
     _check_choice("--shading", shading, ("studio", "none"))
     _check_choice("--background", background, ("studio", "white", "black"))
-    from gdpro_sim.io.turntable import render_file
+    from gdpro_sim.io.views import render_file
 
     with _progress(quiet) as report:
         pictures = render_file(
@@ -245,27 +245,50 @@ def render(
 
 
 @app.command()
-def info(
-    file: Annotated[Path, typer.Argument(help="Asset, simulation or mesh file.")],
+def export(
+    file: Annotated[Path, typer.Argument(help="Asset or simulation (.usdc, .usda, .usdz).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Gaussian splats to write: .ply.")],
+    frame: Annotated[int, typer.Option("--frame", min=0, help="Frame of a simulation.")] = 0,
     json_output: AsJson = False,
+    quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Say what a file holds."""
-    _setup(False, debug)
-    from gdpro_sim.io.describe import describe
+    """Write the Gaussians as a 3DGS PLY, the file that splat viewers read."""
+    _setup(quiet, debug)
+    from gdpro_sim.io.ply import write_ply
+    from gdpro_sim.io.views import gaussians_of
 
-    _show(describe(file), str(file), json_output, False)
+    _check_suffix(output, (".ply",))
+    gaussians = gaussians_of(file, frame)
+    write_ply(output, gaussians)
+    _show({"ply": str(output), "gaussians": len(gaussians)}, f"Gaussians of {file.name}", json_output, quiet)
 
 
 @app.command()
-def scenes(json_output: AsJson = False, debug: Debug = False) -> None:
-    """List the scenes shipped with the package."""
-    _setup(False, debug)
+def info(
+    file: Annotated[Path, typer.Argument(help="Asset, simulation or mesh file.")],
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Say what a file holds; with --quiet, only whether it can be read."""
+    _setup(quiet, debug)
+    from gdpro_sim.io.describe import describe
+
+    _show(describe(file), str(file), json_output, quiet)
+
+
+@app.command()
+def scenes(json_output: AsJson = False, quiet: Quiet = False, debug: Debug = False) -> None:
+    """List the scenes shipped with the package; with --quiet, their names alone."""
+    _setup(quiet, debug)
     from gdpro_sim.simulation.scene import load_scene, scene_names
 
     listing = {name: load_scene(name).description for name in scene_names()}
     if json_output:
         print(json.dumps(listing))
+    elif quiet:
+        print("\n".join(listing))
     else:
         _table("Shipped scenes", list(listing.items()))
 

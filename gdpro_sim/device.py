@@ -13,7 +13,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -101,7 +101,8 @@ def set_thread_count(count: int) -> None:
 def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1) -> None:
     """Call `function(begin, end)` over contiguous ranges that cover `range(count)`, one range per thread.
 
-    `minimum` is the fewest indices worth a thread of their own. The first exception is raised again here.
+    `minimum` is the fewest indices worth a thread of their own. Returns, or raises one of the exceptions,
+    when every range has ended: nothing writes to the caller's memory afterwards.
     """
     global _pool
     if count <= 0:
@@ -116,9 +117,22 @@ def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1
     futures = [_pool.submit(function, bounds[i], bounds[i + 1]) for i in range(1, chunks)]
     try:
         function(0, bounds[1])
-    finally:
-        for future in futures:
-            future.result()
+        wait(futures)
+    except BaseException:
+        wait(futures)  # an interrupt ends the wait above
+        raise
+    for future in futures:
+        future.result()
+
+
+def _forget_pool() -> None:
+    """A forked child has none of its parent's threads: start anew there."""
+    global _pool
+    _pool = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pool)
 
 
 def device_name(tensor: torch.Tensor) -> str:

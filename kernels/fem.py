@@ -61,6 +61,7 @@ class Vertices:
     contact_stiffness: wp.array[wp.float64]  # N/m, along the normal
     stick_stiffness: wp.array[wp.float64]  # N/m, in the tangent plane
     contact_ramp: wp.array[wp.float64]  # m
+    contact_offset: wp.array[wp.float64]  # m
     fixed: wp.array[wp.int32]
     offsets: wp.array[wp.int32]  # into `corners`
     corners: wp.array[wp.int32]  # 4 * element + corner
@@ -217,11 +218,11 @@ def diagonal_slot(corner: int) -> int:
 
 
 @wp.func
-def penetration(ground: Ground, position: wp.vec3d) -> wp.float64:
-    """Depth below the ground, m; zero where there is no ground."""
+def penetration(ground: Ground, offset: wp.float64, position: wp.vec3d) -> wp.float64:
+    """Depth below the ground, m, of the surface `offset` inside a vertex; zero without ground."""
     if ground.enabled == 0:
         return wp.float64(0.0)
-    return ground.height - position[2]
+    return ground.height - offset - position[2]
 
 
 @wp.func
@@ -266,7 +267,11 @@ def friction_limits(
 ):
     """Coulomb limit mu |normal force| of each vertex at x, held fixed while one Newton step is taken, N."""
     i = start + wp.tid()
-    force = normal_force(penetration(ground, x[i]), vertices.contact_stiffness[i], vertices.contact_ramp[i])
+    force = normal_force(
+        penetration(ground, vertices.contact_offset[i], x[i]),
+        vertices.contact_stiffness[i],
+        vertices.contact_ramp[i],
+    )
     limit_out[i] = vertices.friction[i] * force
 
 
@@ -294,7 +299,7 @@ def vertex_energy(
     moved = position - x_previous[i]
     half = wp.float64(0.5) * mass * inverse_dt
     energy = half * inverse_dt * wp.dot(off, off) + half * vertices.damping[i] * wp.dot(moved, moved)
-    depth = penetration(ground, position)
+    depth = penetration(ground, vertices.contact_offset[i], position)
     if depth > wp.float64(0.0) or limit[i] > wp.float64(0.0):
         stiffness = vertices.contact_stiffness[i]
         energy += normal_energy(depth, stiffness, vertices.contact_ramp[i])
@@ -317,7 +322,7 @@ def contact_energy(
     """Energy stored in the ground penalty and the friction springs of each vertex, J."""
     i = start + wp.tid()
     position = x[i]
-    depth = penetration(ground, position)
+    depth = penetration(ground, vertices.contact_offset[i], position)
     energy = wp.float64(0.0)
     if depth > wp.float64(0.0):
         stiffness = vertices.contact_stiffness[i]
@@ -367,7 +372,7 @@ def assemble_vertices(
     gradient += inertial * (position - inertia[i]) + damping * (position - x_previous[i])
     block += wp.diag(wp.vec3d(inertial + damping))
 
-    depth = penetration(ground, position)
+    depth = penetration(ground, vertices.contact_offset[i], position)
     if depth > wp.float64(0.0) or limit[i] > wp.float64(0.0):
         stiffness = vertices.contact_stiffness[i]
         ramp = vertices.contact_ramp[i]
@@ -475,7 +480,9 @@ def finish(
     v_out[i] = inverse_dt * (position - x_out[i])
     x_out[i] = position
     stiffness = vertices.contact_stiffness[i]
-    force = normal_force(penetration(ground, position), stiffness, vertices.contact_ramp[i])
+    force = normal_force(
+        penetration(ground, vertices.contact_offset[i], position), stiffness, vertices.contact_ramp[i]
+    )
     limit = vertices.friction[i] * force
     slip = tangential_slip(position, anchor_out[i])
     stick = vertices.stick_stiffness[i]

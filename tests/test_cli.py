@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,9 +14,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from gdpro_sim.asset import Asset
 from gdpro_sim.cli import main
+from gdpro_sim.errors import RequestError
+from gdpro_sim.io.ply import read_ply
+from gdpro_sim.io.record import record
+from gdpro_sim.io.usd import SimulationReader
+from tests.conditions import posix_only
 
 SCENE = """
 bodies:
@@ -91,7 +99,7 @@ def test_info_render_and_scenes(folder: Path) -> None:
         (["simulate", "nosuch", "-o", "x"], "give a .yaml file or one of"),
         (["simulate", "missing.yaml", "-o", "x"], "no such file"),
         (["simulate", "scene.yaml", "-o", "ball.obj"], "give a folder"),
-        (["simulate", "scene.yaml", "-o", "/proc/nowhere"], "cannot be made"),
+        (["simulate", "scene.yaml", "-o", "ball.obj/deep"], "give a folder"),
         (["simulate", "scene.yaml", "-o", "x", "--device", "cuda:9"], "not available on this machine"),
         (["simulate", "scene.yaml", "-o", "x", "--seed", "-1"], "--seed"),
         (["import", "missing.obj", "-o", "x.usdc"], "missing.obj"),
@@ -105,6 +113,9 @@ def test_info_render_and_scenes(folder: Path) -> None:
         (["import", "ball.usdc", "-o", "x.usdc"], "ball.usdc"),
         (["render", "ball.obj", "-o", "x"], "gdpro import"),
         (["render", "ball.usdc", "-o", "x", "--shading", "pretty"], "studio, none"),
+        (["export", "ball.usdc", "-o", "x.txt"], "must end in .ply"),
+        (["export", "run/simulation.usdc", "-o", "x.ply", "--frame", "10"], "frames 0-9"),
+        (["export", "ball.obj", "-o", "x.ply"], "gdpro import"),
         (["info", "missing.usdc"], "missing.usdc"),
         (["info", "scene.yaml"], "scene.yaml"),
     ],
@@ -128,26 +139,80 @@ def test_wrong_requests_exit_2_with_one_line(
     assert not (folder / "x.usdc").exists()
 
 
+def test_export_writes_what_splat_viewers_read(folder: Path) -> None:
+    gdpro("export", "ball.usdc", "-o", "ball.ply", cwd=folder)
+    asset = Asset.load(folder / "ball.usdc").gaussians.gaussians()
+    assert torch.allclose(read_ply(folder / "ball.ply").means, asset.means)
+    gdpro("export", "run/simulation.usdc", "-o", "last.ply", "--frame", "9", cwd=folder)
+    frame = SimulationReader(folder / "run/simulation.usdc").frame(9)
+    assert torch.equal(read_ply(folder / "last.ply").means, frame.gaussians().means)
+
+
+def test_results_never_replace_what_the_scene_reads(folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "ball.usdc", tmp_path / "asset.usdc")
+    before = (tmp_path / "asset.usdc").read_bytes()
+    (tmp_path / "scene.yaml").write_text("bodies: [{asset: asset.usdc}]\nduration: 0.1")
+    with pytest.raises(RequestError, match=r"would overwrite .*asset\.usdc, which the scene reads"):
+        record(tmp_path / "scene.yaml", tmp_path)
+    assert (tmp_path / "asset.usdc").read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["asset.usdc", "scene.yaml"]
+
+
+def test_pinned_bodies_hang_and_damaged_resume_files_are_passed_over(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "hang.yaml").write_text(
+        f"bodies: [{{asset: {folder / 'ball.usdc'}, size: 0.2, position: [0, 0, 0.5], material: silicone, "
+        "pins: {minimum: [-1, -1, 0.67]}}]\nduration: 0.2\ncamera: {width: 64, height: 48}"
+    )
+    first = record(tmp_path / "hang.yaml", tmp_path / "out")
+    reader = SimulationReader(first.simulation)
+    heights = [reader.frame(i).bodies[0].vertices[:, 2] for i in (0, 6)]
+    assert heights[1].max() == pytest.approx(heights[0].max(), abs=1e-3), "the top is held"
+    assert heights[1].min() < heights[0].min() - 1e-4, "the rest sags"
+
+    class Stop(Exception):
+        pass
+
+    def stop(phase: str, done: int, total: int) -> None:
+        if phase == "simulate" and done == 4:
+            raise Stop
+
+    with pytest.raises(Stop):
+        record(tmp_path / "hang.yaml", tmp_path / "again", on_progress=stop)
+    damaged = tmp_path / "again/.resume/frame_00002.npz"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    second = record(tmp_path / "hang.yaml", tmp_path / "again")
+    assert second.resumed_frames == 2
+    assert np.array_equal(SimulationReader(second.simulation).frame(6).bodies[0].vertices[:, 2], heights[1])
+
+
 def test_debug_shows_the_traceback(folder: Path) -> None:
     done = gdpro("info", "missing.usdc", "--debug", cwd=folder, ok=False)
     assert done.returncode == 2 and "Traceback" in done.stderr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_run_continues_to_the_same_frames(folder: Path, how: int, tmp_path: Path) -> None:
+@posix_only
+@pytest.mark.parametrize("how", ["SIGINT", "SIGKILL"])
+def test_a_stopped_run_continues_to_the_same_frames(folder: Path, how: str, tmp_path: Path) -> None:
     (folder / "long.yaml").write_text(SCENE.format(duration=1.5))
     output = tmp_path / "stopped"
     command = [sys.executable, "-m", "gdpro_sim.cli", "simulate", "long.yaml", "-o", str(output), "--quiet"]
-    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Where the tests run in a background job the shell has told them to ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 120
     while len(list((output / "frames").glob("frame_*.png"))) < 8 and process.poll() is None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    os.kill(process.pid, how)
+    os.kill(process.pid, getattr(signal, how))
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
-    if how == signal.SIGINT:
+    assert process.returncode == (130 if how == "SIGINT" else -9)
+    if how == "SIGINT":
         assert errors.strip() == "gdpro: interrupted; finished frames are kept, the same command continues"
     kept = len(list((output / ".resume").glob("frame_*.npz")))
     assert kept >= 7

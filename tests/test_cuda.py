@@ -12,11 +12,10 @@ import warp as wp
 
 import gdpro_sim
 from gdpro_sim.simulation.scene import check_scene
+from tests.conditions import needs_gpu
 from tests.test_binding import make_bound
 
 KERNELS = Path(__file__).resolve().parents[1] / "kernels"
-
-needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
 
 
 def kernel_modules() -> list[str]:

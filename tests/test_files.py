@@ -10,6 +10,7 @@ import pytest
 
 from gdpro_sim.errors import OutputError, RequestError
 from gdpro_sim.files import atomic_write, check_writable, sha256_of
+from tests.conditions import posix_only
 
 
 def test_the_file_appears_at_the_end(tmp_path: Path) -> None:
@@ -40,6 +41,7 @@ def test_a_full_disk_says_so(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
+@posix_only
 def test_links_are_followed_and_stay_links(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "real" / "a.txt").write_text("old")
@@ -50,6 +52,7 @@ def test_links_are_followed_and_stay_links(tmp_path: Path) -> None:
     assert link.is_symlink() and (tmp_path / "real" / "a.txt").read_text() == "new"
 
 
+@posix_only
 def test_only_regular_files_are_replaced(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path, message in (

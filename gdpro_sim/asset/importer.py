@@ -9,6 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gdpro_sim.asset.asset import Asset
 from gdpro_sim.asset.from_mesh import bind_mesh, vertex_colors
 from gdpro_sim.asset.prims import to_numpy
@@ -96,6 +98,7 @@ def import_mesh(
     if tets:
         asset = tetrahedralize_asset(
             asset,
+            surface=(mesh.vertices, mesh.faces),
             target_tets=target_tets,
             edge_length=edge_length,
             method=tet_method,
@@ -108,6 +111,7 @@ def import_mesh(
 def tetrahedralize_asset(
     asset: Asset,
     *,
+    surface: tuple[np.ndarray, np.ndarray] | None = None,
     target_tets: int = 6_000,
     edge_length: float | None = None,
     method: str = "auto",
@@ -115,16 +119,17 @@ def tetrahedralize_asset(
 ) -> Asset:
     """The asset with fresh tets around its mesh and the mesh embedded in them.
 
-    Options as in `gdpro_sim.meshing.tetrahedralize.tetrahedralize`; they are added to the provenance.
+    surface: vertices [V, 3] and faces [F, 3] to fill, where the asset's mesh is a coarser copy of them (mass
+    must not depend on the number of Gaussians). Other options as in
+    `gdpro_sim.meshing.tetrahedralize.tetrahedralize`; they are added to the provenance.
     Raises MeshError.
     """
     tell: Phase = on_progress or (lambda phase: None)
-    vertices, faces = to_numpy(asset.gaussians.vertices), to_numpy(asset.gaussians.faces)
+    vertices = to_numpy(asset.gaussians.vertices)
+    filled = surface or (vertices, to_numpy(asset.gaussians.faces))
     tell("filling with tetrahedra")
     try:
-        tets = tetrahedralize(
-            vertices, faces, target_tets=target_tets, edge_length=edge_length, method=method
-        )
+        tets = tetrahedralize(*filled, target_tets=target_tets, edge_length=edge_length, method=method)
     except MeshError as error:
         raise MeshError(f"{asset.name}: {error}") from error
     tell("embedding the surface")

@@ -68,6 +68,19 @@ def write_contact_sheet(
         sheet.save(temporary, format="PNG")
 
 
+def frame_name(index: int) -> str:
+    """File name of picture number `index` of a sequence."""
+    return f"frame_{index:05d}.png"
+
+
+def remove_frames_from(folder: Path, count: int) -> None:
+    """Delete the pictures from number `count` on: they belong to an earlier, longer run of this folder."""
+    for old in folder.glob("frame_*.png"):
+        number = old.stem.removeprefix("frame_")
+        if number.isdigit() and int(number) >= count:
+            old.unlink()
+
+
 def spread(count: int, cells: int) -> list[int]:
     """`cells` frame numbers spread evenly over `count` frames, first and last included."""
     if count <= cells:
@@ -75,4 +88,12 @@ def spread(count: int, cells: int) -> list[int]:
     return [round(i * (count - 1) / (cells - 1)) for i in range(cells)]
 
 
-__all__ = ["read_png", "spread", "write_contact_sheet", "write_png", "write_video"]
+__all__ = [
+    "frame_name",
+    "read_png",
+    "remove_frames_from",
+    "spread",
+    "write_contact_sheet",
+    "write_png",
+    "write_video",
+]

@@ -271,7 +271,7 @@ def _floor_shade(maps: _ShadowMaps, centre: torch.Tensor, half: float, height: f
 
 
 class Renderer:
-    """Draws frames from fixed cameras; what does not change between frames is made once.
+    """Draws frames from fixed cameras; what lies behind them is kept while the camera is the same.
 
     cameras: any number; each is lit for its own side
     """
@@ -282,7 +282,7 @@ class Renderer:
             replace(cameras, viewmats=cameras.viewmats[i : i + 1], Ks=cameras.Ks[i : i + 1])
             for i in range(len(cameras))
         ]
-        self._backdrops: dict[tuple[int, str], _Backdrop | torch.Tensor] = {}
+        self._backdrop: tuple[tuple[int, str], _Backdrop | torch.Tensor] | None = None
 
     def render(self, gaussians: Gaussians, normals: torch.Tensor, camera: int = 0) -> np.ndarray:
         """One picture, uint8 [H, W, 3]. normals: [N, 3] unit, used by studio shading."""
@@ -304,9 +304,9 @@ class Renderer:
             sh_degree=lit.sh_degree,
         )
         key = (camera, str(device))
-        if key not in self._backdrops:
-            self._backdrops[key] = _backdrop(one, self.studio, device)
-        backdrop = self._backdrops[key]
+        if self._backdrop is None or self._backdrop[0] != key:
+            self._backdrop = key, _backdrop(one, self.studio, device)
+        backdrop = self._backdrop[1]
         if isinstance(backdrop, _Backdrop):
             backdrop = backdrop.picture(maps)
         picture = color[0] + (1.0 - alpha[0]) * backdrop

@@ -7,11 +7,14 @@ run that was stopped or killed continues where it was, to the same bytes.
 from __future__ import annotations
 
 import csv
+import glob
 import hashlib
 import json
 import logging
+import os
 import shutil
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,14 +22,23 @@ from typing import Any
 
 import numpy as np
 import torch
+import warp as wp
 
 import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.cameras import Cameras
 from gdpro_sim.device import resolve_device, serial_torch
-from gdpro_sim.errors import OutputError
+from gdpro_sim.errors import OutputError, RequestError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
-from gdpro_sim.io.images import read_png, spread, write_contact_sheet, write_png, write_video
+from gdpro_sim.io.images import (
+    frame_name,
+    read_png,
+    remove_frames_from,
+    spread,
+    write_contact_sheet,
+    write_png,
+    write_video,
+)
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.usd import SimulationWriter, body_records
 from gdpro_sim.simulation.compile import check_files, load_assets
@@ -39,6 +51,9 @@ logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 """Called with (phase, done, total); total 0 means the length is not known."""
+
+RESUME_FORMAT = 1
+"""Raise it when frames of an earlier version must not be continued."""
 
 PHASES = ("solve", "resplat", "render", "write")
 
@@ -83,9 +98,13 @@ def record(
     """
     checked = scene if isinstance(scene, Scene) else load_scene(scene)
     check_files(checked)
-    resolve_device(device)
+    device = resolve_device(device)
+    names = [body.name for body in checked.bodies]
+    file_names = ["asset.usdc" if len(names) == 1 else f"asset_{name}.usdc" for name in names]
+    asset_paths = [Path(output) / file for file in file_names]
+    _keep_inputs(checked, asset_paths)
     folder = prepare_folder(output, "simulation.usdc")
-    frames = prepare_folder(folder / "frames", _frame_name(0))
+    frames = prepare_folder(folder / "frames", frame_name(0))
     remove_stale(folder)
     remove_stale(frames)
     store = _Store(folder / ".resume", _fingerprint(checked, device), fresh)
@@ -94,8 +113,6 @@ def record(
 
     begin = time.perf_counter()
     report("prepare", 0, 0)
-    names = [body.name for body in checked.bodies]
-    asset_paths = [folder / ("asset.usdc" if len(names) == 1 else f"asset_{name}.usdc") for name in names]
     kept = dict(zip(names, asset_paths, strict=True)) if store.has_assets(asset_paths) else None
     assets = load_assets(checked, stored=kept, on_progress=lambda phase: report(phase, 0, 0))
     if kept is None:
@@ -108,8 +125,8 @@ def record(
     rows = _run(simulation, folder, store, renderer, report)
 
     begin = time.perf_counter()
-    pictures = [frames / _frame_name(i) for i in range(len(simulation))]
-    _remove_later_frames(frames, len(simulation))
+    pictures = [frames / frame_name(i) for i in range(len(simulation))]
+    remove_frames_from(frames, len(simulation))
     write_video(folder / "preview.mp4", _read_all(pictures, report), checked.fps)
     chosen = spread(len(pictures), 12)
     labels = [f"t = {i / checked.fps:.2f} s" for i in chosen]
@@ -169,7 +186,7 @@ def _run(
             frame = simulation.frame(index, surfaces, diagnostics)
 
             begin = time.perf_counter()
-            path = folder / "frames" / _frame_name(index)
+            path = folder / "frames" / frame_name(index)
             picture = None
             if stored is None or not path.exists():
                 picture = renderer.render(frame.gaussians(), _normals(simulation, frame))
@@ -209,10 +226,6 @@ def _read_all(pictures: list[Path], report: Progress) -> Iterator[np.ndarray]:
         yield read_png(path)
 
 
-def _frame_name(index: int) -> str:
-    return f"frame_{index:05d}.png"
-
-
 def _row(index: int, diagnostics: Diagnostics, milliseconds: dict[str, float]) -> dict[str, Any]:
     """One line of metrics.csv: figures of the solver, then wall milliseconds per phase."""
     row: dict[str, Any] = {"frame": index}
@@ -238,13 +251,6 @@ def _write_metrics(path: Path, rows: list[dict[str, Any]]) -> None:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-
-
-def _remove_later_frames(frames: Path, count: int) -> None:
-    """Pictures past the end belong to an earlier, longer run of this folder."""
-    for old in frames.glob("frame_?????.png"):
-        if int(old.stem[-5:]) >= count:
-            old.unlink()
 
 
 def _camera(scene: Scene, simulation: Simulation) -> Cameras:
@@ -303,15 +309,30 @@ def _save_assets(assets: dict[str, Asset], names: list[str], paths: list[Path]) 
 
 
 def _fingerprint(scene: Scene, device: str) -> str:
-    """Hash of everything that decides the frames: the scene, its asset files, the device, the version."""
-    digest = hashlib.sha256(f"{gdpro_sim.__version__}\n{device}\n{scene.model_dump_json()}".encode())
+    """Hash of what decides the frames: scene, files (and those of the same stem), device, versions."""
+    versions = f"{gdpro_sim.__version__} {RESUME_FORMAT} {wp.config.version}"
+    digest = hashlib.sha256(f"{versions}\n{device}\n{scene.model_dump_json()}".encode())
     for body in scene.bodies:
         for reference in (body.asset, body.texture):
             if reference is not None:
                 path = scene.resolve(reference)
-                if path.is_file():
-                    digest.update(sha256_of(path).encode())
+                beside = path.parent.glob(f"{glob.escape(path.stem)}.*")  # .mtl, textures, buffers
+                for file in sorted({path, *beside}):
+                    if file.is_file():
+                        digest.update(sha256_of(file).encode())
     return digest.hexdigest()
+
+
+def _keep_inputs(scene: Scene, outputs: list[Path]) -> None:
+    """Raise RequestError where a result would be written over a file the scene reads."""
+    written = {os.path.realpath(path) for path in outputs}
+    for body in scene.bodies:
+        for reference in (body.asset, body.texture):
+            if reference is not None and os.path.realpath(scene.resolve(reference)) in written:
+                raise RequestError(
+                    f"the results would overwrite {scene.resolve(reference)}, which the scene reads; "
+                    f"choose another output folder"
+                )
 
 
 class _Store:
@@ -324,16 +345,21 @@ class _Store:
         marker = folder / "run.json"
         known: dict[str, Any] = {}
         try:
-            known = json.loads(marker.read_text(encoding="utf-8"))
+            read = json.loads(marker.read_text(encoding="utf-8"))
+            known = read if isinstance(read, dict) else {}
         except (OSError, ValueError):
             pass
         self._assets: dict[str, str] = {}
         if fresh or known.get("fingerprint") != fingerprint:
+            if not fresh and known:
+                logger.warning(
+                    "%s holds a stopped run of another scene, device or version: starting anew", folder.parent
+                )
             shutil.rmtree(folder, ignore_errors=True)
         else:
             self._assets = dict(known.get("assets", {}))
         self._fingerprint = fingerprint
-        folder.mkdir(exist_ok=True)
+        prepare_folder(folder, "run.json")
         self._write_marker()
 
     def _write_marker(self) -> None:
@@ -368,7 +394,7 @@ class _Store:
                 ]
                 state = {n.removeprefix("state."): data[n] for n in data.files if n.startswith("state.")}
                 figures = json.loads(str(data["figures"]))
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             logger.warning("%s cannot be read (%s); continuing from the frame before it", path, error)
             self._open = False
             return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import struct
 import zipfile
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gdpro_sim.errors import MeshError
+from gdpro_sim.files import sha256_of
 from gdpro_sim.meshing.rawmesh import MAX_FACES, WHITE, RawMesh, RawPart, read_image, too_many_faces
 from gdpro_sim.meshing.repair import (
     consistent_winding,
@@ -279,7 +279,7 @@ def _finish(part: RawPart, path: Path, raw: RawMesh) -> SurfaceMesh:
         part.material_ids.astype(np.int32),
         tuple(part.materials),
         str(path),
-        _sha256(path),
+        sha256_of(path),
         tuple(messages),
     )
 
@@ -293,11 +293,6 @@ def _size_warning(diagonal: float) -> str:
         f"warning: the mesh is {diagonal:.4g} m across, which is doubtful; `--scale {factor:g}` would make "
         f"it {diagonal * factor:.3g} m"
     )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 __all__ = ["MAX_FACES", "SUPPORTED", "load_mesh", "parse_color"]

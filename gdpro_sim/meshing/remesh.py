@@ -13,7 +13,7 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
 
     Takes vertices [V, 3] m and faces [F, 3]; returns the same kinds as float32 and int32. A mesh that has no
     more faces than asked comes back cleaned. Colours do not travel with the triangles: look them up on the
-    original surface at the closest point (`gdpro_sim.meshing.proximity.project`).
+    original surface at the closest point (`gdpro_sim.meshing.proximity.SurfaceIndex.closest`).
     Raises `MeshError` when nothing is left.
     """
     import fast_simplification

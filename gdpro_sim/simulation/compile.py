@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from gdpro_sim.asset import Asset, import_mesh, kind, tetrahedralize_asset
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
+from gdpro_sim.meshing.proximity import SurfaceIndex
+from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.model import Body, FemSettings, Ground, Model
 from gdpro_sim.simulation.scene import Scene, SceneBody
 
@@ -67,7 +69,7 @@ def load_assets(
                 color=body.color,
                 texture=None if body.texture is None else scene.resolve(body.texture),
                 up=body.up,
-                tets=False,
+                target_tets=body.tets,
                 seed=scene.seed,
                 on_progress=tell,
             )
@@ -90,7 +92,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         key: []
         for key in (
             "vertices", "velocities", "tets", "fill", "young", "poisson", "density",
-            "rayleigh_mass", "rayleigh_stiffness", "friction", "pinned",
+            "rayleigh_mass", "rayleigh_stiffness", "friction", "contact_offset", "pinned",
         )
     }  # fmt: skip
     vertex_begin = tet_begin = 0
@@ -111,7 +113,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         shift = np.asarray(body.position) - _anchor(turned, body.anchor)
         surface = (turned + shift).astype(np.float32)
         vertices = asset.tets.vertices.astype(np.float64) @ turn.T + shift
-        centre = surface.astype(np.float64).mean(axis=0)
+        centre = _centre_of_mass(asset.tets, vertices)
         _check_above_ground(scene, body, surface)
 
         count, elements = len(vertices), len(asset.tets.tets)
@@ -123,6 +125,9 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         for key in ("young", "poisson", "density", "rayleigh_mass", "rayleigh_stiffness"):
             columns[key].append(np.full(elements, getattr(material, key), np.float32))
         columns["friction"].append(np.full(count, material.friction, np.float32))
+        columns["contact_offset"].append(
+            _outside(asset.tets.vertices, rest, asset.gaussians.faces.cpu().numpy())
+        )
         columns["pinned"].append(_pinned(scene, body, vertices))
         bodies.append(
             Body(
@@ -147,6 +152,21 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         fem=FemSettings(**{k: v for k, v in options.model_dump().items() if k != "kind"}),
         device=device,
     )
+
+
+def _centre_of_mass(tets: TetMesh, vertices: np.ndarray) -> np.ndarray:
+    """Centre of mass [3] of placed tet `vertices` [P, 3] of one density."""
+    mass = tets.volumes() * tets.fill
+    return (mass[:, None] * vertices[tets.tets].mean(axis=1)).sum(axis=0) / mass.sum()
+
+
+def _outside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """How far each of `points` [P, 3] lies outside a surface, float32 [P] m; zero inside."""
+    index = SurfaceIndex(vertices, faces, winding=True)
+    face, weights = index.closest(points)
+    nearest = np.einsum("pc,pci->pi", weights.astype(np.float64), vertices[faces[face]])
+    distance = np.linalg.norm(points - nearest, axis=1)
+    return np.where(index.inside(points), 0.0, distance).astype(np.float32)
 
 
 def _material(body: SceneBody, asset: Asset) -> Material:
@@ -176,7 +196,11 @@ def _check_above_ground(scene: Scene, body: SceneBody, surface: np.ndarray) -> N
 def _pinned(scene: Scene, body: SceneBody, vertices: np.ndarray) -> np.ndarray:
     if body.pins is None:
         return np.zeros(len(vertices), bool)
-    inside = np.all((vertices >= body.pins.minimum) & (vertices <= body.pins.maximum), axis=1)
+    inside = np.ones(len(vertices), bool)
+    if body.pins.minimum is not None:
+        inside &= np.all(vertices >= body.pins.minimum, axis=1)
+    if body.pins.maximum is not None:
+        inside &= np.all(vertices <= body.pins.maximum, axis=1)
     if not inside.any():
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         raise SceneError(

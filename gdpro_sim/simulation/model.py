@@ -69,6 +69,8 @@ class Model:
     fill:        [T] fraction of material in each element
     young, poisson, density, rayleigh_mass, rayleigh_stiffness: [T]
     friction:    [P] Coulomb coefficient of each vertex against the ground
+    contact_offset: [P] m, how far each vertex lies outside the surface at rest (a lattice overlaps it);
+                 it touches the ground that much later
     pinned:      [P] bool, vertices that never move
     """
 
@@ -83,6 +85,7 @@ class Model:
     rayleigh_mass: np.ndarray
     rayleigh_stiffness: np.ndarray
     friction: np.ndarray
+    contact_offset: np.ndarray
     pinned: np.ndarray
     gravity: tuple[float, float, float]
     ground: Ground | None

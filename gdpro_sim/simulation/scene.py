@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import importlib.resources
 import importlib.util
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -29,10 +28,8 @@ class _Strict(BaseModel):
 class Pins(_Strict):
     """Vertices of the body's tets held in place: those inside a world-space box at the start."""
 
-    minimum: Vector = Field(default=(-math.inf, -math.inf, -math.inf), description="lower corner, m")
-    maximum: Vector = Field(default=(math.inf, math.inf, math.inf), description="upper corner, m")
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
+    minimum: Vector | None = Field(default=None, description="lower corner, m; default: no limit")
+    maximum: Vector | None = Field(default=None, description="upper corner, m; default: no limit")
 
 
 class SceneBody(_Strict):
@@ -97,6 +94,12 @@ class Camera(_Strict):
     fov: float = Field(default=32.0, gt=1.0, lt=150.0, description="vertical field of view, degrees")
     width: int = Field(default=960, ge=16, le=8192, description="pixels; even, for video")
     height: int = Field(default=720, ge=16, le=8192, description="pixels; even, for video")
+
+    @model_validator(mode="after")
+    def _apart(self) -> Camera:
+        if self.eye is not None and self.eye == self.target:
+            raise ValueError(f"eye and target coincide at {list(self.eye)}")
+        return self
 
     @field_validator("width", "height")
     @classmethod
@@ -167,7 +170,10 @@ class Scene(_Strict):
         """Absolute path of an asset reference. Raises SceneError for an unknown `package:`."""
         if reference.startswith("package:"):
             package, _, inside = reference.removeprefix("package:").partition("/")
-            spec = importlib.util.find_spec(package) if package else None
+            try:
+                spec = importlib.util.find_spec(package) if package.isidentifier() else None
+            except (ImportError, ValueError):
+                spec = None
             if spec is None or not spec.submodule_search_locations:
                 raise SceneError(f"{self.name}: asset {reference!r}: no installed Python package {package!r}")
             return Path(next(iter(spec.submodule_search_locations))) / inside

@@ -79,7 +79,7 @@ class Projection:
 def array(tensor: torch.Tensor, dtype: type) -> Any:
     """The tensor's memory as a kernel argument; trailing axes become a vector or matrix where `dtype` is one.
 
-    It does not keep the tensor alive.
+    It keeps the tensor alive.
     """
     return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
 

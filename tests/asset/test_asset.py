@@ -17,6 +17,7 @@ from gdpro_sim.asset import Asset, is_asset, kind
 from gdpro_sim.errors import AssetError, OutputError, RequestError
 from gdpro_sim.meshing.tetmesh import TetMesh
 from tests.asset.sample import assert_bits, assert_same, make_asset, make_bound
+from tests.conditions import posix_only
 
 SUFFIXES = (".usdc", ".usda", ".usdz")
 
@@ -314,6 +315,7 @@ def test_damaged_bytes_are_an_error_or_a_warning(tmp_path: Path, caplog: pytest.
 # ---- files that cannot be written ----
 
 
+@posix_only
 def test_paths_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
     asset = make_asset()
     with pytest.raises(AssetError, match=r"must end in \.usdc"):
@@ -338,6 +340,7 @@ def test_a_folder_without_permission_is_refused(tmp_path: Path, monkeypatch: pyt
     assert os.listdir(tmp_path) == []
 
 
+@posix_only
 def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
     """A limit on file size makes USD's own writes fail, as a full disk does."""
     paths = [tmp_path / f"a{suffix}" for suffix in SUFFIXES]

@@ -12,6 +12,7 @@ import torch
 from gdpro_sim.errors import AssetError, RequestError
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.ply import read_ply, write_ply
+from tests.conditions import posix_only
 
 
 def sample(degree: int, count: int = 40) -> Gaussians:
@@ -94,6 +95,7 @@ def test_files_that_hold_no_gaussians_say_so(tmp_path: Path) -> None:
         read_ply(tmp_path / "absent.ply")
 
 
+@posix_only
 def test_device_nodes_are_not_replaced(tmp_path: Path) -> None:
     """Renaming over /dev/null, as root, would destroy it; a named pipe stands in for it here."""
     os.mkfifo(tmp_path / "pipe.ply")

@@ -22,6 +22,7 @@ from gdpro_sim.simulation.frame import BodyFrame, Frame
 from gdpro_sim.simulation.model import Diagnostics
 from tests.asset.sample import assert_bits, make_asset
 from tests.asset.test_asset import validation_errors
+from tests.conditions import posix_only
 
 SUFFIXES = (".usdc", ".usda", ".usdz")
 
@@ -218,6 +219,7 @@ def test_requests_that_cannot_work_are_refused_at_once(tmp_path: Path, assets: d
     assert os.listdir(tmp_path) == []
 
 
+@posix_only
 def test_a_full_disk_is_an_output_error(tmp_path: Path) -> None:
     """A limit on file size makes USD's own writes fail, as a full disk does: on appending and on closing."""
     path = tmp_path / "s.usdc"

@@ -171,6 +171,7 @@ def test_interruption_leaves_no_process_behind() -> None:
     code = (
         "import signal, threading, os, subprocess, numpy as np\n"
         "import gdpro_sim.meshing.tetrahedralize as m\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it\n"
         "made = []\n"
         "class Spy(subprocess.Popen):\n"
         "    def __init__(self, *a, **k):\n"

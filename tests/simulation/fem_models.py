@@ -68,6 +68,7 @@ def make_model(
         rayleigh_mass=each(rayleigh_mass, elements),
         rayleigh_stiffness=each(rayleigh_stiffness, elements),
         friction=each(friction, count),
+        contact_offset=each(0.0, count),
         pinned=np.zeros(count, bool) if pinned is None else pinned,
         gravity=gravity,
         ground=ground,

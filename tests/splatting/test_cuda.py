@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from gdpro_sim.splatting import rasterization
+from tests.conditions import needs_gpu
 from tests.splatting.scenes import cameras, cloud, features, harmonics
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
+@needs_gpu
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "D"])
 def test_cuda_equals_cpu(mode: str) -> None:
     scene, views = cloud(2000, 0), cameras(2, 200, 150)

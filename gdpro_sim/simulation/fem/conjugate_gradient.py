@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from gdpro_sim.device import run_chunks
@@ -33,6 +32,7 @@ class ConjugateGradient:
     inverse_diagonal:  [P] mat33d preconditioner
     right_hand_side:   [P] vec3d
     solution:          [P] vec3d
+    residual:          [P] vec3d, b - A x of the last solve as the recurrence carries it
     """
 
     def __init__(self, topology: Topology, device: str) -> None:
@@ -44,7 +44,7 @@ class ConjugateGradient:
         self.columns: wp.array = wp.array(topology.columns, dtype=wp.int32, device=device)
         self.values = wp.zeros(len(topology.columns), dtype=wp.mat33d, device=device)
         self.inverse_diagonal = wp.zeros(self.rows, dtype=wp.mat33d, device=device)
-        self.right_hand_side, self.solution, self._r, self._z, self._p, self._q = (
+        self.right_hand_side, self.solution, self.residual, self._z, self._p, self._q = (
             wp.zeros(self.rows, dtype=wp.vec3d, device=device) for _ in range(6)
         )
         self._dots = wp.zeros(self.blocks, dtype=wp.float64, device=device)
@@ -79,7 +79,7 @@ class ConjugateGradient:
                 self.inverse_diagonal,
                 self.right_hand_side,
             ],
-            outputs=[self._r, self._z, self._p, self._q, self.solution, self._scalars],
+            outputs=[self.residual, self._z, self._p, self._q, self.solution, self._scalars],
             device=self.device,
         )
 
@@ -87,7 +87,7 @@ class ConjugateGradient:
         self._over_rows(
             linalg.cg_reset,
             [self.right_hand_side, self.inverse_diagonal],
-            [self.solution, self._r, self._z, self._p, self._dots],
+            [self.solution, self.residual, self._z, self._p, self._dots],
         )
         self._scalar(linalg.cg_begin)
         self._tolerance.fill_(tolerance)
@@ -105,7 +105,7 @@ class ConjugateGradient:
             self._over_rows(
                 linalg.cg_update,
                 [self._p, self._q, self.inverse_diagonal, self._scalars],
-                [self.solution, self._r, self._z, self._dots],
+                [self.solution, self.residual, self._z, self._dots],
             )
             self._scalar(linalg.cg_set_beta)
 
@@ -146,12 +146,12 @@ class ConjugateGradient:
         command.launch()
 
     def matrix(self) -> Any:
-        """A as a scipy BSR matrix (a copy), for tests and debugging."""
+        """A as a scipy BSR matrix; on the CPU it shares the memory of `values`."""
         from scipy.sparse import bsr_matrix
 
         count = 3 * self.rows
-        parts = (self.values.numpy().copy(), np.array(self.columns.numpy()), np.array(self.offsets.numpy()))
-        return bsr_matrix(parts, shape=(count, count))
+        parts = (self.values.numpy(), self.columns.numpy(), self.offsets.numpy())
+        return bsr_matrix(parts, shape=(count, count), copy=False)
 
 
 __all__ = ["ConjugateGradient", "SolveReport"]

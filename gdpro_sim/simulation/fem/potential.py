@@ -77,6 +77,7 @@ class IncrementalPotential:
         self.vertices.contact_stiffness = _reals(stiffness, device)
         self.vertices.stick_stiffness = _reals(stick, device)
         self.vertices.contact_ramp = _reals(ramp, device)
+        self.vertices.contact_offset = _reals(model.contact_offset, device)
         self.vertices.fixed = wp.array(self.fixed.astype(np.int32), dtype=wp.int32, device=device)
         self.vertices.offsets = wp.array(topology.corner_offsets, dtype=wp.int32, device=device)
         self.vertices.corners = wp.array(topology.corners, dtype=wp.int32, device=device)

@@ -11,6 +11,7 @@ import warp as wp
 
 from gdpro_sim.errors import SolverError
 from gdpro_sim.simulation.fem.potential import IncrementalPotential
+from gdpro_sim.simulation.fem.rigid_modes import RigidModes
 from gdpro_sim.simulation.model import Diagnostics, Model
 
 logger = logging.getLogger(__name__)
@@ -59,6 +60,7 @@ class SolverFEM:
     def __init__(self, model: Model) -> None:
         self.model = model
         self._potential = IncrementalPotential(model)
+        self._rigid = RigidModes(model.tets, self._potential.mass, self._potential.fixed)
         self._rest = model.vertices.astype(np.float64)
         count = len(model.vertices)
         self._saved = [
@@ -109,7 +111,7 @@ class SolverFEM:
         try:
             for _ in range(count):
                 self._advance(dt / count, 0)
-        except SolverError:
+        except BaseException:  # Ctrl-C too: half a step is no state to continue from
             for saved, array in zip(self._saved, state, strict=True):
                 wp.copy(array, saved)
             self._counters = before
@@ -163,6 +165,7 @@ class SolverFEM:
                 return _Outcome(converged=True, finite=True, residual=acceleration * dt)
 
             report = potential.system.solve(settings.cg_tolerance, settings.cg_iterations)
+            self._rigid.correct(potential.system, potential.base.numpy(), NEGLIGIBLE * tolerance / (dt * dt))
             slope, largest_move = potential.step_measures()
             self._counters.newton_iterations += 1
             self._counters.cg_iterations += report.iterations
@@ -262,7 +265,8 @@ class SolverFEM:
         momentum = (mass * v).sum(axis=0)
         angular = (mass * np.cross(x, v)).sum(axis=0)
         ground = self.model.ground
-        depth = ground.height - x[:, 2] if ground is not None else np.zeros(len(x))
+        offset = self.model.contact_offset
+        depth = ground.height - offset - x[:, 2] if ground is not None else np.zeros(len(x))
         c = self._counters
         return Diagnostics(
             time=self._time,

@@ -1,4 +1,4 @@
-"""Pictures of files: an asset on a turntable, or every frame of a simulation."""
+"""What asset and simulation files look like: pictures of them, and their Gaussians."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from gdpro_sim.asset import Asset, kind
 from gdpro_sim.cameras import Cameras
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import RequestError
-from gdpro_sim.files import prepare_folder
-from gdpro_sim.io.images import write_png
+from gdpro_sim.files import prepare_folder, remove_stale
+from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.io.images import frame_name, remove_frames_from, write_png
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.usd import SimulationReader
 from gdpro_sim.simulation.frame import Frame
@@ -40,18 +41,14 @@ def render_file(
     path, folder = Path(file), Path(output)
     view = {"azimuth": -60.0, "elevation": 14.0, "fov": 32.0, "width": 960, "height": 720, **(camera or {})}
     name = resolve_device(device)
-    what = kind(path)
-    if what not in ("asset", "simulation"):
-        raise RequestError(
-            f"{path} is neither an asset nor a simulation; turn a mesh into an asset first: "
-            f"gdpro import {path} -o {path.stem}.usdc"
-        )
+    what = _kind(path)
     report = on_progress or (lambda phase, done, total: None)
-    prepare_folder(folder, "frame_00000.png")
+    prepare_folder(folder, frame_name(0))
+    remove_stale(folder)
     written: list[Path] = []
 
     def write(picture: np.ndarray, total: int) -> None:
-        written.append(folder / f"frame_{len(written):05d}.png")
+        written.append(folder / frame_name(len(written)))
         write_png(written[-1], picture)
         report("render", len(written), total)
 
@@ -64,6 +61,7 @@ def render_file(
         )
         for index in range(views):
             write(renderer.render(gaussians, normals, index), views)
+        remove_frames_from(folder, views)
         return written
     reader = SimulationReader(path)
     boxes = np.array([_bounds(reader.frame(i)) for i in sorted({0, len(reader) // 2, len(reader) - 1})])
@@ -79,7 +77,32 @@ def render_file(
             [b.normals(torch.from_numpy(f.vertices)) for b, f in zip(bodies, frame.bodies, strict=True)]
         )
         write(renderer.render(frame.gaussians().to(name), normals), len(reader))
+    remove_frames_from(folder, len(reader))
     return written
+
+
+def gaussians_of(file: str | Path, frame: int = 0) -> Gaussians:
+    """The Gaussians of an asset at rest, or of one frame of a simulation, all bodies together.
+
+    Raises RequestError for a file that is neither, or a frame past the end.
+    """
+    path = Path(file)
+    if _kind(path) == "asset":
+        return Asset.load(path).gaussians.gaussians()
+    reader = SimulationReader(path)
+    if frame >= len(reader):
+        raise RequestError(f"{path} has frames 0-{len(reader) - 1}, got {frame}")
+    return reader.frame(frame).gaussians()
+
+
+def _kind(path: Path) -> str:
+    what = kind(path)
+    if what not in ("asset", "simulation"):
+        raise RequestError(
+            f"{path} is neither an asset nor a simulation; turn a mesh into an asset first: "
+            f"gdpro import {path} -o {path.stem}.usdc"
+        )
+    return what
 
 
 def _turntable(low: np.ndarray, high: np.ndarray, views: int, view: dict[str, Any]) -> Cameras:
@@ -105,4 +128,4 @@ def _bounds(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-__all__ = ["render_file"]
+__all__ = ["gaussians_of", "render_file"]
