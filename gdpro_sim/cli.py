@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import signal
 import sys
 import time
 import traceback
@@ -126,12 +127,13 @@ def import_command(
 ) -> None:
     """Turn a mesh into a Gaussian asset: bound Gaussians, tetrahedra, one USD file."""
     _setup(quiet, debug)
+    _check_exists(mesh)
+    _check_choice("--up", up, ("auto", "y", "z"))
+    _check_suffix(output, (".usdc", ".usda", ".usdz"))
     from gdpro_sim.asset import import_mesh
     from gdpro_sim.files import check_writable
     from gdpro_sim.materials import Material
 
-    _check_choice("--up", up, ("auto", "y", "z"))
-    _check_suffix(output, (".usdc", ".usda", ".usdz"))
     check_writable(output)
     chosen = None
     if material is not None:
@@ -212,11 +214,13 @@ def render(
     frames: Annotated[
         int, typer.Option("--frames", min=1, max=10_000, help="Views of an asset's turntable.")
     ] = 24,
-    width: Annotated[int, typer.Option("--width", min=16, max=8192)] = 960,
-    height: Annotated[int, typer.Option("--height", min=16, max=8192)] = 720,
-    azimuth: Annotated[float, typer.Option("--azimuth", help="Degrees from +X.")] = -60.0,
-    elevation: Annotated[float, typer.Option("--elevation", min=-89.0, max=89.0, help="Degrees.")] = 14.0,
-    fov: Annotated[float, typer.Option("--fov", min=1.0, max=150.0, help="Vertical, degrees.")] = 32.0,
+    width: Annotated[int | None, typer.Option("--width", min=16, max=8192)] = None,
+    height: Annotated[int | None, typer.Option("--height", min=16, max=8192)] = None,
+    azimuth: Annotated[float | None, typer.Option("--azimuth", help="Degrees from +X.")] = None,
+    elevation: Annotated[
+        float | None, typer.Option("--elevation", min=-89.0, max=89.0, help="Degrees.")
+    ] = None,
+    fov: Annotated[float | None, typer.Option("--fov", min=1.0, max=150.0, help="Vertical, degrees.")] = None,
     shading: Annotated[str, typer.Option("--shading", help="studio or none.")] = "studio",
     background: Annotated[str, typer.Option("--background", help="studio, white or black.")] = "studio",
     device: Device = "auto",
@@ -224,10 +228,15 @@ def render(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Render an asset as a turntable, or every frame of a simulation, to PNG pictures."""
+    """Render an asset as a turntable, or every frame of a simulation, to PNG pictures.
+
+    A simulation is seen through its scene's camera, unless the options say otherwise.
+    """
     _setup(quiet, debug)
     _check_choice("--shading", shading, ("studio", "none"))
     _check_choice("--background", background, ("studio", "white", "black"))
+    _check_exists(file)
+    view = {"azimuth": azimuth, "elevation": elevation, "fov": fov, "width": width, "height": height}
     from gdpro_sim.io.views import render_file
 
     with _progress(quiet) as report:
@@ -235,7 +244,7 @@ def render(
             file,
             output,
             views=frames,
-            camera={"azimuth": azimuth, "elevation": elevation, "fov": fov, "width": width, "height": height},
+            camera={key: value for key, value in view.items() if value is not None},
             shading=shading,
             background=background,
             device=device,
@@ -255,10 +264,11 @@ def export(
 ) -> None:
     """Write the Gaussians as a 3DGS PLY, the file that splat viewers read."""
     _setup(quiet, debug)
+    _check_exists(file)
+    _check_suffix(output, (".ply",))
     from gdpro_sim.io.ply import write_ply
     from gdpro_sim.io.views import gaussians_of
 
-    _check_suffix(output, (".ply",))
     gaussians = gaussians_of(file, frame)
     write_ply(output, gaussians)
     _show({"ply": str(output), "gaussians": len(gaussians)}, f"Gaussians of {file.name}", json_output, quiet)
@@ -273,6 +283,7 @@ def info(
 ) -> None:
     """Say what a file holds; with --quiet, only whether it can be read."""
     _setup(quiet, debug)
+    _check_exists(file)
     from gdpro_sim.io.describe import describe
 
     _show(describe(file), str(file), json_output, quiet)
@@ -310,6 +321,12 @@ def _show(data: dict[str, Any], title: str, as_json: bool, quiet: bool) -> None:
         _table(title, list(rows))
 
 
+def _check_exists(path: Path) -> None:
+    """Before the heavy imports: a mistyped name should be told at once."""
+    if not path.exists():
+        raise RequestError(f"{path}: no such file")
+
+
 def _check_choice(option: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise RequestError(f"{option} must be one of {', '.join(allowed)}, got {value!r}")
@@ -325,9 +342,18 @@ def _first_line(error: ValueError) -> str:
     return str(errors()[0]["msg"]).removeprefix("Value error, ") if callable(errors) else str(error)
 
 
+class _Terminated(BaseException):
+    """SIGTERM: end like Ctrl-C, so that files are closed and workers stopped."""
+
+
+def _terminate(*_: object) -> None:
+    raise _Terminated
+
+
 def main() -> None:
-    """Entry point: one line per error; exit code 0, 1 (failed run), 2 (wrong request) or 130 (Ctrl-C)."""
+    """Entry point: one line per error; exits with 0, 1 (failed run), 2 (wrong request), 130 (Ctrl-C), 143."""
     debug = "--debug" in sys.argv
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         code = app(standalone_mode=False) or 0
         if code == 130:  # typer turns Ctrl-C into this exit code
@@ -350,6 +376,8 @@ def main() -> None:
         kept = "; finished frames are kept, the same command continues" if "simulate" in sys.argv else ""
         print(f"gdpro: interrupted{kept}", file=sys.stderr)
         sys.exit(130)
+    except _Terminated:
+        sys.exit(143)
     except MemoryError:
         print("gdpro: out of memory; lower --budget or the number of tetrahedra", file=sys.stderr)
         sys.exit(1)

@@ -20,6 +20,7 @@ import trimesh
 from gdpro_sim.asset import Asset
 from gdpro_sim.cli import main
 from gdpro_sim.errors import RequestError
+from gdpro_sim.io.images import read_png
 from gdpro_sim.io.ply import read_ply
 from gdpro_sim.io.record import record
 from gdpro_sim.io.usd import SimulationReader
@@ -87,6 +88,9 @@ def test_info_render_and_scenes(folder: Path) -> None:
     assert len(list((folder / "turn").glob("frame_*.png"))) == 3
     gdpro("render", "run/simulation.usdc", "-o", "again", "--shading", "none", *size, cwd=folder)
     assert len(list((folder / "again").glob("frame_*.png"))) == 10
+    gdpro("render", "run/simulation.usdc", "-o", "again", cwd=folder)
+    for name in ("frame_00000.png", "frame_00009.png"):
+        assert np.array_equal(read_png(folder / "again" / name), read_png(folder / "run/frames" / name)), name
     assert "jelly_bunny" in json.loads(gdpro("scenes", "--json", cwd=folder).stdout)
 
 

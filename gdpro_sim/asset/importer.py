@@ -72,6 +72,8 @@ def import_mesh(
             raise AssetError(f"{path} is already a gdpro {found}; {way}")
     tell("reading the mesh")
     mesh = load_mesh(path, texture=texture, color=color, up=up, scale=scale)
+    for message in mesh.messages:
+        log.warning("%s: %s", path.name, message)
     tell("binding Gaussians")
     bound = bind_mesh(mesh, budget=budget, seed=seed)
     provenance: dict[str, Any] = {

@@ -26,7 +26,6 @@ import warp as wp
 
 import gdpro_sim
 from gdpro_sim.asset import Asset
-from gdpro_sim.cameras import Cameras
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import OutputError, RequestError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
@@ -121,8 +120,11 @@ def record(
     simulation = Simulation(checked, assets, device=device)
     seconds["prepare"] = time.perf_counter() - begin
 
-    renderer = Renderer(_camera(checked, simulation), _studio(checked, simulation))
-    rows = _run(simulation, folder, store, renderer, report)
+    low, high = _reach(checked, simulation)
+    studio = _studio(checked, simulation)
+    renderer = Renderer(frame_camera(low, high, **checked.camera.model_dump()), studio)
+    preview = {"low": low.tolist(), "high": high.tolist(), "studio": asdict(studio)}
+    rows = _run(simulation, folder, store, renderer, preview, report)
 
     begin = time.perf_counter()
     pictures = [frames / frame_name(i) for i in range(len(simulation))]
@@ -158,6 +160,7 @@ def _run(
     folder: Path,
     store: _Store,
     renderer: Renderer,
+    preview: dict[str, Any],
     report: Progress,
 ) -> list[dict[str, Any]]:
     """Every frame: solve (or take it from an interrupted run), re-splat, draw, write."""
@@ -170,7 +173,11 @@ def _run(
         folder / "simulation.usdc",
         scene.fps,
         body_records(simulation.model, simulation.assets),
-        metadata={"scene": scene.model_dump(mode="json"), "version": gdpro_sim.__version__},
+        metadata={
+            "scene": scene.model_dump(mode="json"),
+            "preview": preview,
+            "version": gdpro_sim.__version__,
+        },
         gravity=scene.gravity,
         ground=None if scene.ground is None else scene.ground.height,
     ) as writer:
@@ -253,8 +260,8 @@ def _write_metrics(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def _camera(scene: Scene, simulation: Simulation) -> Cameras:
-    """The scene's camera; what it leaves out is chosen so that flight, landing and slide fit the picture."""
+def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box in m that the camera should show: flight, landing and slide of every body."""
     boxes = []
     for body, placed in zip(scene.bodies, simulation.model.bodies, strict=True):
         low, high = placed.surface.min(axis=0).astype(float), placed.surface.max(axis=0).astype(float)
@@ -267,7 +274,7 @@ def _camera(scene: Scene, simulation: Simulation) -> Cameras:
         spread_out = 0.12 * (high[:2] - low[:2])
         low[:2] -= spread_out
         high[:2] += spread_out
-    return frame_camera(low, high, **scene.camera.model_dump())
+    return low, high
 
 
 def _path(scene: Scene, body: SceneBody, low: np.ndarray, size: float, friction: float) -> list[np.ndarray]:

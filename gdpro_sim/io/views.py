@@ -19,6 +19,7 @@ from gdpro_sim.io.images import frame_name, remove_frames_from, write_png
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.usd import SimulationReader
 from gdpro_sim.simulation.frame import Frame
+from gdpro_sim.simulation.scene import Camera
 
 
 @serial_torch()
@@ -36,10 +37,10 @@ def render_file(
     """Write `frame_00000.png` … into the folder `output` and return the paths.
 
     An asset is drawn from `views` sides, a simulation once per frame. camera: azimuth, elevation, fov in
-    degrees, width and height in pixels. Raises RequestError or AssetError for a file that is neither.
+    degrees, width and height in pixels; what it leaves out is the simulation's own camera.
+    Raises RequestError or AssetError for a file that is neither.
     """
     path, folder = Path(file), Path(output)
-    view = {"azimuth": -60.0, "elevation": 14.0, "fov": 32.0, "width": 960, "height": 720, **(camera or {})}
     name = resolve_device(device)
     what = _kind(path)
     report = on_progress or (lambda phase, done, total: None)
@@ -53,6 +54,7 @@ def render_file(
         report("render", len(written), total)
 
     if what == "asset":
+        view = {**Camera().model_dump(), **(camera or {})}
         bound = Asset.load(path).gaussians.to(name)
         gaussians, normals = bound.gaussians(), bound.normals()
         low, high = bound.vertices.amin(0).cpu().numpy(), bound.vertices.amax(0).cpu().numpy()
@@ -64,13 +66,7 @@ def render_file(
         remove_frames_from(folder, views)
         return written
     reader = SimulationReader(path)
-    boxes = np.array([_bounds(reader.frame(i)) for i in sorted({0, len(reader) // 2, len(reader) - 1})])
-    low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
-    ground = reader.metadata.get("scene", {}).get("ground")
-    renderer = Renderer(
-        frame_camera(low, high, **view),
-        _studio(boxes[0, 0], boxes[0, 1], ground["height"] if ground else None, shading, background),
-    )
+    renderer = _recorded(reader, camera or {}, shading, background)
     bodies = [body.gaussians.to(name) for body in reader.bodies]
     for frame in reader:
         normals = torch.cat(
@@ -79,6 +75,21 @@ def render_file(
         write(renderer.render(frame.gaussians().to(name), normals), len(reader))
     remove_frames_from(folder, len(reader))
     return written
+
+
+def _recorded(reader: SimulationReader, camera: dict[str, Any], shading: str, background: str) -> Renderer:
+    """A renderer that shows what the run's own pictures show, unless `camera` says otherwise."""
+    scene, preview = reader.metadata.get("scene"), reader.metadata.get("preview")
+    if scene is None or preview is None:
+        boxes = np.array([_bounds(reader.frame(i)) for i in sorted({0, len(reader) // 2, len(reader) - 1})])
+        low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
+        view = {**Camera().model_dump(), **camera}
+        return Renderer(frame_camera(low, high, **view), _studio(low, high, None, shading, background))
+    view = {**scene["camera"], **camera}
+    if {"azimuth", "elevation"} & set(camera):
+        view["eye"] = None
+    studio = Studio(**{**preview["studio"], "shading": shading, "background": background})
+    return Renderer(frame_camera(preview["low"], preview["high"], **view), studio)
 
 
 def gaussians_of(file: str | Path, frame: int = 0) -> Gaussians:

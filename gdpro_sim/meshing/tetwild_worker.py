@@ -8,10 +8,13 @@ int32 [T, 4].
 
 from __future__ import annotations
 
+import ctypes
 import sys
 import types
 
 import numpy as np
+
+PR_SET_PDEATHSIG = 1
 
 
 def import_pytetwild() -> types.ModuleType:
@@ -35,6 +38,8 @@ def limit_self(seconds: int, memory: int) -> None:
 
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which kills this process
         signal.alarm(seconds)
+        if sys.platform == "linux":
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     except (ImportError, AttributeError, ValueError, OSError):

@@ -214,9 +214,23 @@ def load_scene(scene: str | Path) -> Scene:
     return _parse(text, str(path), path.resolve().parent)
 
 
+class _UniqueKeys(yaml.SafeLoader):
+    """Safe YAML that refuses a key given twice; plain YAML keeps the last silently."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value!r} stands there twice", key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def _parse(text: str, source: str, folder: Path) -> Scene:
     try:
-        data = yaml.safe_load(text)
+        data = yaml.load(text, Loader=_UniqueKeys)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "unknown place"
@@ -261,6 +275,8 @@ def _explain(item: Any, source: str) -> str:
         return f"{source}: {place}: unknown key{hint}; allowed: {', '.join(allowed)}"
     if item["type"] == "missing":
         return f"{source}: {place}: is required"
+    if item["type"] == "too_short":
+        return f"{source}: {place}: must hold at least one item"
     message = str(item["msg"])
     message = message.removeprefix("Value error, ").replace("Input should be", "must be")
     message = message[0].lower() + message[1:]

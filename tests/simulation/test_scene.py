@@ -39,8 +39,10 @@ def test_defaults_and_relative_paths(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("bodies: []", "bodies"),
+        ("bodies: []", "bodies: must hold at least one item"),
         ("a: [", "not valid YAML at line 1"),
+        (MINIMAL + "fps: 24\nfps: 30", "line 4, column 1: the key 'fps' stands there twice"),
+        (MINIMAL + "camera: {eye: [1, 1, 1], target: [1, 1, 1]}", "camera: eye and target coincide"),
         ("- 1", "a scene is a mapping"),
         ("", "a scene is a mapping"),
         (
@@ -84,9 +86,10 @@ def test_missing_files_and_names() -> None:
         load_scene("jelly_buny")
     with pytest.raises(SceneError, match="no such file"):
         load_scene("/nowhere/scene.yaml")
-    scene = check_scene({"bodies": [{"asset": "package:nosuchpackage/a.obj"}]})
-    with pytest.raises(SceneError, match="no installed Python package 'nosuchpackage'"):
-        scene.resolve(scene.bodies[0].asset)
+    for package in ("nosuchpackage", "..", "a.b", ""):
+        scene = check_scene({"bodies": [{"asset": f"package:{package}/a.obj"}]})
+        with pytest.raises(SceneError, match=f"no installed Python package {package!r}"):
+            scene.resolve(scene.bodies[0].asset)
 
 
 @pytest.mark.parametrize("name", PRESETS)
