@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.binding import BoundGaussians, sh_basis, vertex_normals
@@ -161,3 +162,26 @@ def test_vertex_normals_point_out_of_a_tetrahedron() -> None:
     faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=torch.int32)
     normals = vertex_normals(vertices, faces)
     assert ((normals * (vertices - vertices.mean(0))).sum(1) > 0).all()
+
+
+def test_normals_are_smooth_on_a_ball_and_sharp_on_a_cube() -> None:
+    for mesh in (trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box().subdivide().subdivide()):
+        n = len(mesh.faces)
+        weights = torch.tensor([[0.6, 0.3, 0.1]]).repeat(n, 1)
+        bound = BoundGaussians(
+            torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32),
+            torch.tensor(np.asarray(mesh.faces), dtype=torch.int32),
+            torch.arange(n, dtype=torch.int32),
+            weights,
+            torch.tensor([[1.0, 0.0]]).repeat(n, 1),
+            torch.zeros((n, 3)),
+            torch.zeros(n),
+            torch.zeros((n, 1, 3)),
+        )
+        points = bound.gaussians().means
+        if n > 1000:
+            expected = torch.nn.functional.normalize(points, dim=1)
+        else:  # the face of the cube that a point lies on
+            axis = points.abs().argmax(dim=1)
+            expected = torch.nn.functional.one_hot(axis, 3) * points.gather(1, axis[:, None]).sign()
+        assert (bound.normals() * expected).sum(1).min() > 0.999
