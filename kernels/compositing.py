@@ -13,16 +13,21 @@ Up to four channels are blended at once; more channels run again over the same l
 `composite_pixel` is for GPUs: one index per pixel, 256 neighbours are one tile, so a block shares its list.
 """
 
+import platform
+
 import warp as wp
 
 from gdpro_sim.kernels.projection import BOX, FACTOR, LOG2_CUTOFF, LOG2_OPACITY, MEAN, REACH, RECORD, TILE
+
+X86 = platform.machine().lower() in ("x86_64", "amd64")
+"""Other processors have no choice of vector width, and their compilers no such flag."""
 
 wp.set_module_options(
     {
         "enable_backward": False,
         "max_unroll": 0,
         "default_grid_stride": False,
-        "cpu_compiler_flags": "-march=native -mprefer-vector-width=512",
+        "cpu_compiler_flags": "-march=native" + (" -mprefer-vector-width=512" if X86 else ""),
     }
 )
 
