@@ -44,6 +44,7 @@ def test_a_stiff_body_in_flight_falls_and_spins() -> None:
     assert loose.converged
     mass = 7850.0 * 0.2 * 0.1 * 0.1
     assert loose.momentum[2] == pytest.approx(-mass * 9.81 * 10 / 60, rel=1e-5)
-    assert loose.angular_momentum[2] == pytest.approx(tight.angular_momentum[2], rel=1e-3)
+    # Newton stops at 1 mm/s, and the corners move at 0.6 m/s.
+    assert loose.angular_momentum[2] == pytest.approx(tight.angular_momentum[2], rel=5e-3)
     start = SolverFEM(model).diagnostics().angular_momentum[2]
     assert 0.9 * start < loose.angular_momentum[2] < start  # backward Euler damps a spin of 0.05 rad a step

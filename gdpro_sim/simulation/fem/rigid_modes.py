@@ -34,46 +34,57 @@ class RigidModes:
         self._mass = mass
         self._pieces = [np.flatnonzero(labels == k) for k in np.flatnonzero(~held)]
 
-    def correct(self, system: ConjugateGradient, x: np.ndarray, negligible: float) -> None:
-        """Add the missing rigid motions to `system.solution`.
+    def correct(self, system: ConjugateGradient, x: np.ndarray, negligible: float) -> bool:
+        """Add the missing rigid motions to `system.solution`; whether there were any.
 
         x: [P, 3] m, where the system was linearised. Nothing is done while the accelerations that the
         residual force and torque of every piece could cause stay below `negligible` m/s^2.
         """
         residual = system.residual.numpy()
-        modes = [self._modes(x, piece) for piece in self._pieces]
-        loads = [np.einsum("nki,ni->k", z, residual[p]) for z, p in zip(modes, self._pieces, strict=True)]
-        # Columns of a mode set have unit length in the mass norm: the load is a generalised acceleration.
-        largest = max(
-            (
-                np.linalg.norm(load) / np.sqrt(self._mass[p].sum())
-                for load, p in zip(loads, self._pieces, strict=True)
-            ),
-            default=0.0,
-        )
-        if largest <= negligible:
-            return
+        frames = [self._frame(x, piece) for piece in self._pieces]
+        if all(
+            self._acceleration(residual[piece], *frame) <= negligible
+            for piece, frame in zip(self._pieces, frames, strict=True)
+        ):
+            return False
         basis = np.zeros((len(x), 3, 6))
-        for z, piece in zip(modes, self._pieces, strict=True):
-            basis[piece] = np.swapaxes(z, 1, 2)
+        for piece, (_, arms, radius) in zip(self._pieces, frames, strict=True):
+            basis[piece] = rigid_basis(arms / radius)
         product = (system.matrix() @ basis.reshape(-1, 6)).reshape(len(x), 3, 6)
         solution = system.solution.numpy()
-        for z, piece, load in zip(modes, self._pieces, loads, strict=True):
-            stiffness = np.einsum("nki,nil->kl", z, product[piece])
+        for piece in self._pieces:
+            z = basis[piece].reshape(-1, 6)
+            stiffness = z.T @ product[piece].reshape(-1, 6)
+            load = z.T @ residual[piece].reshape(-1)
             amounts = np.linalg.lstsq(0.5 * (stiffness + stiffness.T), load, rcond=1e-14)[0]
-            solution[piece] += np.einsum("nki,k->ni", z, amounts)
+            solution[piece] += (z @ amounts).reshape(-1, 3)
         if system.device != "cpu":  # on the CPU `solution` is the array itself
             system.solution.assign(solution)
+        return True
 
-    def _modes(self, x: np.ndarray, piece: np.ndarray) -> np.ndarray:
-        """Three translations and three rotations of a piece [n, 6, 3], of unit length in the mass norm."""
-        mass, points = self._mass[piece], x[piece]
-        arms = points - (mass[:, None] * points).sum(0) / mass.sum()
-        modes = np.zeros((len(piece), 6, 3))
-        modes[:, (0, 1, 2), (0, 1, 2)] = 1.0
-        for k in range(3):
-            modes[:, 3 + k] = np.cross(np.eye(3)[k], arms)
-        return modes / np.sqrt(np.einsum("n,nki,nki->k", mass, modes, modes))[None, :, None]
+    def _frame(self, x: np.ndarray, piece: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """Mass of a piece, its vertices relative to the centre of mass [n, 3], and its radius of gyration."""
+        mass = self._mass[piece]
+        total = float(mass.sum())
+        arms = x[piece] - (mass @ x[piece]) / total
+        return total, arms, max(float(np.sqrt(mass @ (arms * arms).sum(1) / total)), 1e-30)
+
+    @staticmethod
+    def _acceleration(force: np.ndarray, mass: float, arms: np.ndarray, radius: float) -> float:
+        """Size of the acceleration that forces [n, 3] would give a rigid piece, spin included, m/s^2."""
+        turn = np.cross(arms, force).sum(0)
+        return float(np.linalg.norm(force.sum(0)) + np.linalg.norm(turn) / radius) / mass
+
+
+def rigid_basis(arms: np.ndarray) -> np.ndarray:
+    """Three unit translations and three rotations e_k x arm, [n, 3, 6] for arms [n, 3]."""
+    basis = np.zeros((len(arms), 3, 6))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        basis[:, k, k] = 1.0
+        basis[:, i, 3 + k] = -arms[:, j]
+        basis[:, j, 3 + k] = arms[:, i]
+    return basis
 
 
 __all__ = ["RigidModes"]

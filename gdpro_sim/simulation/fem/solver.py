@@ -165,8 +165,10 @@ class SolverFEM:
                 return _Outcome(converged=True, finite=True, residual=acceleration * dt)
 
             report = potential.system.solve(settings.cg_tolerance, settings.cg_iterations)
-            self._rigid.correct(potential.system, potential.base.numpy(), NEGLIGIBLE * tolerance / (dt * dt))
             slope, largest_move = potential.step_measures()
+            negligible = NEGLIGIBLE * max(tolerance, 0.1 * largest_move) / (dt * dt)
+            if self._rigid.correct(potential.system, potential.base.numpy(), negligible):
+                slope, largest_move = potential.step_measures()
             self._counters.newton_iterations += 1
             self._counters.cg_iterations += report.iterations
             residual = largest_move / dt
