@@ -118,7 +118,7 @@ def import_command(
         str | None, typer.Option("--material", help="Material preset stored in the asset.")
     ] = None,
     tets: Annotated[
-        int, typer.Option("--tets", min=0, max=500_000, help="Tetrahedra to aim for; 0 for none.")
+        int, typer.Option("--tets", min=0, max=500_000, help="Tetrahedra to aim for, roughly; 0 for none.")
     ] = 6_000,
     seed: Seed = None,
     json_output: AsJson = False,

@@ -105,11 +105,14 @@ def test_axes_do_not_jump_between_frames() -> None:
     bound = make_bound(2)
     drift = torch.randn(bound.vertices.shape, generator=torch.Generator().manual_seed(5))
     previous = bound.gaussians(bound.vertices + 1e-6 * drift)
+    jumps = 0
     for step in range(1, 100):
         current = bound.gaussians(bound.vertices + 1e-3 * step * drift)
         cosine = (current.quats * previous.quats).sum(1).abs()
-        assert cosine.quantile(0.05) > 0.98
+        jumps += int((cosine < 0.98).sum())
         previous = current
+    # A triangle that nearly collapses on its way may turn fast; swapped axes would show in every frame.
+    assert jumps <= 6, f"{jumps} of {99 * len(bound)}"
 
 
 def test_collapsed_and_empty_inputs_stay_finite() -> None:

@@ -52,7 +52,7 @@ class SceneBody(_Strict):
     )
     up: Literal["auto", "y", "z"] = Field(default="auto", description="up axis of a mesh file")
     tets: int = Field(
-        default=6_000, ge=50, le=500_000, description="tetrahedra to aim for, where none are cached"
+        default=6_000, ge=50, le=500_000, description="tetrahedra to aim for, where none are cached; roughly"
     )
     size: float | None = Field(default=None, gt=0.0, description="longest side of the bounding box, m")
     scale: float = Field(default=1.0, gt=0.0, description="uniform scale, where size is not given")
