@@ -157,8 +157,8 @@ def torch_stream(tensor: torch.Tensor) -> contextlib.AbstractContextManager[obje
 def serial_torch() -> Iterator[None]:
     """Run torch's own CPU operators on one thread inside the block.
 
-    Their worker threads spin while they wait and stall behind ours on a busy machine, and sums no longer depend
-    on the number of cores.
+    Their worker threads spin while they wait and stall behind ours on a busy machine, and sums no longer
+    depend on the number of cores.
     """
     import torch
 
