@@ -29,9 +29,11 @@ def check_images(
 
 
 def check_alike(names: Sequence[str], *images: torch.Tensor) -> None:
-    """Raise ValueError unless all images have one shape (channels apart where 1), dtype and device."""
+    """Raise ValueError unless all images have the shape, dtype and device of the first."""
     first = images[0]
     for name, image in zip(names[1:], images[1:], strict=True):
+        if not isinstance(image, torch.Tensor):
+            raise ValueError(f"{name} must be a torch tensor, got {type(image).__name__}")
         if image.shape != first.shape:
             raise ValueError(
                 f"{name} must have the shape of {names[0]}, {list(first.shape)}, got {list(image.shape)}"
