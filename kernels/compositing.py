@@ -13,21 +13,17 @@ Up to four channels are blended at once; more channels run again over the same l
 `composite_pixel` is for GPUs: one index per pixel, 256 neighbours are one tile, so a block shares its list.
 """
 
-import platform
-
 import warp as wp
 
+from gdpro_sim.kernels.lanes import CPU_FLAGS
 from gdpro_sim.kernels.projection import BOX, FACTOR, LOG2_CUTOFF, LOG2_OPACITY, MEAN, REACH, RECORD, TILE
-
-X86 = platform.machine().lower() in ("x86_64", "amd64")
-"""Other processors have no choice of vector width, and their compilers no such flag."""
 
 wp.set_module_options(
     {
         "enable_backward": False,
         "max_unroll": 0,
         "default_grid_stride": False,
-        "cpu_compiler_flags": "-march=native" + (" -mprefer-vector-width=512" if X86 else ""),
+        "cpu_compiler_flags": CPU_FLAGS,
     }
 )
 
@@ -35,32 +31,33 @@ ALPHA_MAX = wp.constant(0.99)
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
 LN2 = wp.constant(0.6931471805599453)
 
+LOCATE_TILE = f"""
+    const int tiles_x = (width + {TILE - 1}) / {TILE}, tiles_y = (height + {TILE - 1}) / {TILE};
+    const int camera = tile / (tiles_x * tiles_y);
+    const int in_camera = tile - camera * tiles_x * tiles_y;
+    const int tile_x = in_camera % tiles_x * {TILE}, tile_y = in_camera / tiles_x * {TILE};
+    const int begin = offsets.data[tile];
+"""
+"""Snippet: `tile`, `offsets`, image size -> camera, tile_x, tile_y (first pixel) and begin of the list."""
 
-@wp.func
-def log2_alpha(records: wp.array2d[float], i: int, px: float, py: float) -> float:
-    """Base-2 logarithm of a Gaussian's alpha at a pixel position, before the 0.99 limit."""
-    dx = px - records[i, MEAN]
-    dy = py - records[i, MEAN + 1]
-    u = records[i, FACTOR] * dx + records[i, FACTOR + 1] * dy
-    v = records[i, FACTOR + 2] * dy
-    return records[i, LOG2_OPACITY] - u * u - v * v
+LOCATE_PIXEL = f"""
+    const int tile = index / {TILE * TILE};
+    const int in_tile = index - tile * {TILE * TILE};
+{LOCATE_TILE}
+    const int x = tile_x + in_tile % {TILE}, y = tile_y + in_tile / {TILE};
+    const bool inside = x < width && y < height;
+    const size_t pixel = ((size_t)camera * height + y) * width + x;
+"""
+"""Snippet: `index` -> the same, and pixel x, y, its number, and whether it lies inside the image."""
 
-
-# The state of a pixel's blending is its transmittance T with the sign as a flag: T > 0 goes on, T < 0 has
-# stopped at |T|. exp2(p): p = n + f with |f| <= 1/2 through the 1.5 * 2^23 trick, then a degree-5 minimax
-# polynomial in f (relative error 2e-7) whose exponent field n is added to.
-_TILE_SNIPPET = f"""
-#if !defined(__CUDACC__)
+TILE_LANES = f"""
     typedef float F __attribute__((ext_vector_type(16)));
     typedef int I __attribute__((ext_vector_type(16)));
     typedef bool M __attribute__((ext_vector_type(16)));
     const F column = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}};
     const F row = {{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
     const F block_x = 4.0f * column, block_y = 4.0f * row;
-    const float inside = 1.0f, outside = -1.0f;
-
-    F T[16], c0[16], c1[16], c2[16], c3[16];
-    float ub[16] __attribute__((aligned(64))), vb[16] __attribute__((aligned(64)));
+    const F inside = (F)1.0f, outside = (F)-1.0f, zero = (F)0.0f;
     auto fma = [](F a, F b, F c) {{ return __builtin_elementwise_fma(a, b, c); }};
     auto bits = [](I mask) {{
         M m = __builtin_convertvector(mask, M);
@@ -68,22 +65,61 @@ _TILE_SNIPPET = f"""
         __builtin_memcpy(&b, &m, 2);
         return (unsigned)b;
     }};
+    const int x_end = width - tile_x < {TILE} ? width - tile_x : {TILE};
+    const int y_end = height - tile_y < {TILE} ? height - tile_y : {TILE};
 
+    // Transmittance of the pixels of 16 blocks, with the sign as a flag: T > 0 goes on, T < 0 has stopped at |T|.
+    F T[16];
     unsigned alive = 0;
     for (int k = 0; k < 16; ++k) {{
-        const F x = (float)tile_x + (float)(4 * (k & 3)) + column;
-        const F y = (float)tile_y + (float)(4 * (k >> 2)) + row;
-        const I in = (x < (float)width) & (y < (float)height);
-        T[k] = in ? (F)inside : (F)outside;
-        c0[k] = c1[k] = c2[k] = c3[k] = (F)0.0f;
+        const F x = (float)(4 * (k & 3)) + column, y = (float)(4 * (k >> 2)) + row;
+        const I in = (x < (float)x_end) & (y < (float)y_end);
+        T[k] = in ? inside : outside;
         if (bits(in)) alive |= 1u << k;
     }}
+"""
+"""CPU snippet: 16 pixel lanes, 16 blocks of 4 x 4 pixels in a tile; `alive` has a bit per block."""
 
-    const float* const record = records.data;
-    const float* const colour = channels.data + channel_offset;
-    const int* const id = ids.data;
-    int at = begin;
-    for (; at < end && alive; ++at) {{
+EXP2 = """
+            // exp2(p): p = n + f with |f| <= 1/2 through the 1.5 * 2^23 trick, then a degree-5 minimax polynomial
+            // in f (relative error 2e-7) to whose exponent field n is added.
+            const F n = p + 12582912.0f;
+            const F f = p - (n - 12582912.0f);
+            F e = fma(f, (F)1.3264727e-3f, (F)9.671513e-3f);
+            e = fma(e, f, (F)5.5507336e-2f);
+            e = fma(e, f, (F)2.4022242e-1f);
+            e = fma(e, f, (F)6.9314700e-1f);
+            e = fma(e, f, (F)1.0f);
+            I exponent, mantissa;
+            __builtin_memcpy(&exponent, &n, 64);
+            __builtin_memcpy(&mantissa, &e, 64);
+            mantissa += exponent << 23;
+            F raw;
+            __builtin_memcpy(&raw, &mantissa, 64);
+"""
+"""CPU snippet: p -> raw = exp2(p), for -126 < p < 127."""
+
+BLEND = f"""
+            const F alpha = __builtin_elementwise_min(raw, (F){float(ALPHA_MAX)!r}f);
+            const F t = T[k];
+            const F next = fma(-alpha, t, t);
+            const I seen = p >= {float(LOG2_CUTOFF)!r}f;
+            const I blend = seen & (next > {float(TRANSMITTANCE_MIN)!r}f);
+            const F w = blend ? alpha * t : zero;
+"""
+"""CPU snippet: raw alpha of block k -> weights w of the lanes that blend."""
+
+ADVANCE = """
+            T[k] = blend ? next : t;
+            const I stop = seen & ~blend;
+            if (__builtin_expect(bits(stop & (t > 0.0f)) != 0, 0)) {
+                T[k] = stop ? -__builtin_elementwise_abs(t) : T[k];
+                if (!bits(T[k] > 0.0f)) alive &= ~(1u << k);
+            }
+"""
+"""CPU snippet: transmittance behind block k."""
+
+ENTRY = f"""
         const size_t g = (size_t)id[at];
         if (end - at > 4) __builtin_prefetch(record + (size_t)id[at + 4] * {RECORD});
         const float* const r = record + g * {RECORD};
@@ -106,48 +142,43 @@ _TILE_SNIPPET = f"""
         const float l = r[{LOG2_OPACITY}];
         const float* const c = colour + g * channel_stride;
         const float r0 = c[0], r1 = c[1], r2 = c[2], r3 = c[3];
+"""
+"""CPU snippet: entry `at` of the list -> its record and the mask of blocks it reaches."""
+
+POWER = """
+            const F u = u_lane + ub[k], v = v_lane + vb[k];
+            const F p = fma(-v, v, fma(-u, u, (F)l));
+"""
+"""CPU snippet: base-2 logarithm p of alpha at the lanes of block k."""
+
+_TILE = f"""
+#if !defined(__CUDACC__)
+{LOCATE_TILE}{TILE_LANES}
+    F c0[16], c1[16], c2[16], c3[16];
+    for (int k = 0; k < 16; ++k) c0[k] = c1[k] = c2[k] = c3[k] = zero;
+    float ub[16] __attribute__((aligned(64))), vb[16] __attribute__((aligned(64)));
+    const float* const record = records.data;
+    const float* const colour = channels.data + channel_offset;
+    const int channel_stride = channels.shape[1];
+    const int* const id = ids.data;
+    const int end = offsets.data[tile + 1];
+    int at = begin;
+    for (; at < end && alive; ++at) {{
+{ENTRY}
         do {{
             const int k = __builtin_ctz(mask);
             mask &= mask - 1;
-            const F u = u_lane + ub[k], v = v_lane + vb[k];
-            const F p = fma(-v, v, fma(-u, u, (F)l));
-            const F n = p + 12582912.0f;
-            const F f = p - (n - 12582912.0f);
-            F e = fma(f, (F)1.3264727e-3f, (F)9.671513e-3f);
-            e = fma(e, f, (F)5.5507336e-2f);
-            e = fma(e, f, (F)2.4022242e-1f);
-            e = fma(e, f, (F)6.9314700e-1f);
-            e = fma(e, f, (F)1.0f);
-            I exponent, mantissa;
-            __builtin_memcpy(&exponent, &n, 64);
-            __builtin_memcpy(&mantissa, &e, 64);
-            mantissa += exponent << 23;
-            F alpha;
-            __builtin_memcpy(&alpha, &mantissa, 64);
-            alpha = __builtin_elementwise_min(alpha, (F)0.99f);
-            const F t = T[k];
-            const F weight = alpha * t;
-            const F next = fma(-alpha, t, t);
-            const I seen = p >= {float(LOG2_CUTOFF)!r}f;
-            const I blend = seen & (next > 1.0e-4f);
-            const I stop = seen & ~blend;
-            const F w = blend ? weight : (F)0.0f;
+{POWER}{EXP2}{BLEND}
             c0[k] = fma(w, (F)r0, c0[k]);
             c1[k] = fma(w, (F)r1, c1[k]);
             c2[k] = fma(w, (F)r2, c2[k]);
-            c3[k] = fma(w, (F)r3, c3[k]);
-            T[k] = blend ? next : t;
-            if (__builtin_expect(bits(stop & (t > 0.0f)) != 0, 0)) {{
-                T[k] = stop ? -__builtin_elementwise_abs(t) : T[k];
-                if (!bits(T[k] > 0.0f)) alive &= ~(1u << k);
-            }}
+            if (count > 3) c3[k] = fma(w, (F)r3, c3[k]);
+{ADVANCE}
         }} while (mask);
     }}
 
     // Write what lies inside the image, over the background; expected depth is divided by alpha.
-    const int x_end = width - tile_x < {TILE} ? width - tile_x : {TILE};
-    const int y_end = height - tile_y < {TILE} ? height - tile_y : {TILE};
-    const float* const background = backgrounds.data + (size_t)camera * image_channels + first_channel;
+    const float* const background = backgrounds.data + (size_t)camera * count;
     for (int y = 0; y < y_end; ++y) {{
         for (int x = 0; x < x_end; ++x) {{
             const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
@@ -155,7 +186,7 @@ _TILE_SNIPPET = f"""
             const float alpha = 1.0f - t;
             const float sum[4] = {{c0[k][lane], c1[k][lane], c2[k][lane], c3[k][lane]}};
             const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
-            float* const out = image_out.data + pixel * image_channels + first_channel;
+            float* const out = image_out.data + pixel * count;
             for (int i = 0; i < count; ++i) {{
                 out[i] = sum[i] + t * background[i];
                 if (i == divided) out[i] = sum[i] / (alpha > 1e-10f ? alpha : 1e-10f);
@@ -169,24 +200,17 @@ _TILE_SNIPPET = f"""
 """
 
 
-@wp.func_native(_TILE_SNIPPET)
+@wp.func_native(_TILE)
 def blend_tile(
+    tile: int,
     records: wp.array2d[float],
     channels: wp.array2d[float],
     channel_offset: int,
-    channel_stride: int,
+    offsets: wp.array[int],
     ids: wp.array[int],
-    begin: int,
-    end: int,
     backgrounds: wp.array2d[float],
-    tile: int,
-    camera: int,
-    tile_x: int,
-    tile_y: int,
     width: int,
     height: int,
-    image_channels: int,
-    first_channel: int,
     count: int,
     divided: int,
     image_out: wp.array2d[float],
@@ -208,7 +232,6 @@ def composite_tile(
     backgrounds: wp.array2d[float],
     width: int,
     height: int,
-    first_channel: int,
     count: int,
     divided: int,
     # Out:
@@ -217,33 +240,21 @@ def composite_tile(
     transmittance_out: wp.array[float],
     stops_out: wp.array[int],
 ):
-    """Blend channel `channels[g, channel_offset + j]` into image channel first_channel + j, j < count <= 4.
+    """Blend channels[g, channel_offset + j] into image channel j < count <= 4.
 
-    `divided` is the one divided by alpha (expected depth), or -1. `stops_out` holds the list position
+    `divided` is the channel divided by alpha (expected depth), or -1. `stops_out` holds the list position
     where a tile had nothing left to blend.
     """
-    tile = start + wp.tid()
-    tiles_x = (width + TILE - 1) / TILE
-    tiles_y = (height + TILE - 1) / TILE
-    camera = tile / (tiles_x * tiles_y)
-    in_camera = tile - camera * tiles_x * tiles_y
     blend_tile(
+        start + wp.tid(),
         records,
         channels,
         channel_offset,
-        channels.shape[1],
+        offsets,
         ids,
-        offsets[tile],
-        offsets[tile + 1],
         backgrounds,
-        tile,
-        camera,
-        in_camera % tiles_x * TILE,
-        in_camera / tiles_x * TILE,
         width,
         height,
-        backgrounds.shape[1],
-        first_channel,
         count,
         divided,
         image_out,
@@ -251,6 +262,16 @@ def composite_tile(
         transmittance_out,
         stops_out,
     )
+
+
+@wp.func
+def log2_alpha(records: wp.array2d[float], i: int, px: float, py: float) -> float:
+    """Base-2 logarithm of a Gaussian's alpha at a pixel position, before the 0.99 limit."""
+    dx = px - records[i, MEAN]
+    dy = py - records[i, MEAN + 1]
+    u = records[i, FACTOR] * dx + records[i, FACTOR + 1] * dy
+    v = records[i, FACTOR + 2] * dy
+    return records[i, LOG2_OPACITY] - u * u - v * v
 
 
 @wp.kernel
@@ -265,7 +286,6 @@ def composite_pixel(
     backgrounds: wp.array2d[float],
     width: int,
     height: int,
-    first_channel: int,
     count: int,
     divided: int,
     # Out:
@@ -310,10 +330,10 @@ def composite_pixel(
     pixel = (camera * height + y) * width + x
     alpha = 1.0 - transmittance
     for j in range(count):
-        value = blended[j] + transmittance * backgrounds[camera, first_channel + j]
+        value = blended[j] + transmittance * backgrounds[camera, j]
         if j == divided:
             value = blended[j] / wp.max(alpha, 1.0e-10)
-        image_out[pixel, first_channel + j] = value
+        image_out[pixel, j] = value
     alphas_out[pixel] = alpha
     transmittance_out[pixel] = transmittance
     last_out[pixel] = last

@@ -1,4 +1,4 @@
-"""Projection of 3D Gaussians to 2D ones, and their colours.
+"""Projection of 3D Gaussians to 2D ones, forward.
 
 Every Gaussian seen by a camera becomes one record of 16 float32 (a 64-byte cache line):
 
@@ -13,19 +13,21 @@ Every Gaussian seen by a camera becomes one record of 16 float32 (a 64-byte cach
     REACH         1  square of: distance in (u, v) at which alpha = 1/255, plus half a 4 x 4 block's diagonal
     COMPENSATION  1  sqrt(det covariance / det blurred covariance) where antialiased, else 1
 
-Culled Gaussians have a record of zeros, an empty rectangle and an infinite sort key.
+Culled Gaussians have a record of zeros, an empty rectangle and an infinite sort key. The index of each kernel
+is a group of `LANES` Gaussians of one camera (see `gdpro_sim.kernels.lanes`), camera after camera.
 """
 
 import warp as wp
 
-from gdpro_sim.kernels.harmonics import harmonics_sum
+from gdpro_sim.kernels.harmonics import HARMONICS
+from gdpro_sim.kernels.lanes import CPU_FLAGS, PRELUDE
 
 wp.set_module_options(
     {
         "enable_backward": False,
         "max_unroll": 0,
         "default_grid_stride": False,
-        "cpu_compiler_flags": "-march=native",
+        "cpu_compiler_flags": CPU_FLAGS,
     }
 )
 
@@ -56,59 +58,215 @@ SQRT_HALF_LOG2_E = wp.constant(0.8493218002880191)
 SLACK = wp.constant(1.0001)
 """Boxes grow by this factor so that rounding cannot push a pixel at the cutoff outside."""
 
+ROTATION = """
+    // Rotation matrix q of quaternions wxyz of any nonzero length; NaN for zero.
+    const float* const quat = (const float*)(quats.data + n);
+    const F qw0 = load(quat, 4), qx0 = load(quat + 1, 4), qy0 = load(quat + 2, 4), qz0 = load(quat + 3, 4);
+    const F longest = max_(max_(abs_(qw0), abs_(qx0)), max_(abs_(qy0), abs_(qz0)));
+    const F qw1 = qw0 / longest, qx1 = qx0 / longest, qy1 = qy0 / longest, qz1 = qz0 / longest;
+    const F unit = 1.0f / sqrt_(qw1 * qw1 + qx1 * qx1 + qy1 * qy1 + qz1 * qz1);
+    const F qw = qw1 * unit, qx = qx1 * unit, qy = qy1 * unit, qz = qz1 * unit;
+    const F q00 = 1.0f - 2.0f * (qy * qy + qz * qz), q01 = 2.0f * (qx * qy - qw * qz),
+        q02 = 2.0f * (qx * qz + qw * qy), q10 = 2.0f * (qx * qy + qw * qz),
+        q11 = 1.0f - 2.0f * (qx * qx + qz * qz), q12 = 2.0f * (qy * qz - qw * qx),
+        q20 = 2.0f * (qx * qz - qw * qy), q21 = 2.0f * (qy * qz + qw * qx),
+        q22 = 1.0f - 2.0f * (qx * qx + qy * qy);
+"""
+"""Snippet: `quats`, first Gaussian `n` -> qij, and what the gradient needs: qw..qz, longest, unit."""
 
-@wp.func
-def rotation_of(quat: wp.vec4) -> wp.mat33:
-    """Rotation matrix of a quaternion wxyz of any nonzero length; NaN for zero."""
-    q = quat / wp.max(wp.abs(quat))
-    q = q * wp.sqrt(2.0 / wp.dot(q, q))
-    w = q[0]
-    x = q[1]
-    y = q[2]
-    z = q[3]
-    return wp.mat33(
-        1.0 - (y * y + z * z), x * y - w * z, x * z + w * y,
-        x * y + w * z, 1.0 - (x * x + z * z), y * z - w * x,
-        x * z - w * y, y * z + w * x, 1.0 - (x * x + y * y),
-    )  # fmt: skip
+CAMERA = """
+    // Camera-space point (x, y, z) = R mean + t.
+    const float* const view = (const float*)(viewmats.data + camera);
+    const float r00 = view[0], r01 = view[1], r02 = view[2], r10 = view[4], r11 = view[5], r12 = view[6],
+        r20 = view[8], r21 = view[9], r22 = view[10];
+    const float* const mean = (const float*)(means.data + n);
+    const F mx = load(mean, 3), my = load(mean + 1, 3), mz = load(mean + 2, 3);
+    const F x = r00 * mx + r01 * my + r02 * mz + view[3];
+    const F y = r10 * mx + r11 * my + r12 * mz + view[7];
+    const F z = r20 * mx + r21 * my + r22 * mz + view[11];
+"""
+"""Snippet: `viewmats`, `means` -> x, y, z and the rotation rij."""
+
+PINHOLE = """
+    const float* const k = (const float*)(intrinsics.data + camera);
+    const float fx = k[0], skew = k[1], cx = k[2], fy = k[4], cy = k[5];
+    const F inverse_z = 1.0f / z;
+    const F offset_x = (fx * x + skew * y) * inverse_z;
+    const F offset_y = fy * y * inverse_z;
+"""
+"""Snippet: pixel offsets from the principal point."""
+
+COVARIANCE = """
+    // Perspective is linearized at the mean, pulled to at most 0.15 image sizes outside the image: farther out
+    // the linearization would blow Gaussians up (as in the code of 3D Gaussian Splatting).
+    const float low_x = -cx - 0.15f * (float)width, high_x = (float)width - cx + 0.15f * (float)width;
+    const float low_y = -cy - 0.15f * (float)height, high_y = (float)height - cy + 0.15f * (float)height;
+    const F pulled_x = min_(max_(offset_x, splat(low_x)), splat(high_x));
+    const F pulled_y = min_(max_(offset_y, splat(low_y)), splat(high_y));
+
+    // Rows of the projection's Jacobian in camera space, then in world space.
+    const F jx0 = fx * inverse_z, jx1 = skew * inverse_z, jx2 = -pulled_x * inverse_z;
+    const F jy1 = fy * inverse_z, jy2 = -pulled_y * inverse_z;
+    const F wx0 = r00 * jx0 + r10 * jx1 + r20 * jx2, wx1 = r01 * jx0 + r11 * jx1 + r21 * jx2,
+        wx2 = r02 * jx0 + r12 * jx1 + r22 * jx2;
+    const F wy0 = r10 * jy1 + r20 * jy2, wy1 = r11 * jy1 + r21 * jy2, wy2 = r12 * jy1 + r22 * jy2;
+
+    // Along the Gaussian's axes, then times its scales: the 2D covariance is M M^T with rows m_x, m_y.
+    const float* const scale = (const float*)(scales.data + n);
+    const F s0 = load(scale, 3), s1 = load(scale + 1, 3), s2 = load(scale + 2, 3);
+    const F ax0 = q00 * wx0 + q10 * wx1 + q20 * wx2, ax1 = q01 * wx0 + q11 * wx1 + q21 * wx2,
+        ax2 = q02 * wx0 + q12 * wx1 + q22 * wx2;
+    const F ay0 = q00 * wy0 + q10 * wy1 + q20 * wy2, ay1 = q01 * wy0 + q11 * wy1 + q21 * wy2,
+        ay2 = q02 * wy0 + q12 * wy1 + q22 * wy2;
+    const F mx0 = s0 * ax0, mx1 = s1 * ax1, mx2 = s2 * ax2, my0 = s0 * ay0, my1 = s1 * ay1, my2 = s2 * ay2;
+    const F xx = mx0 * mx0 + mx1 * mx1 + mx2 * mx2, yy = my0 * my0 + my1 * my1 + my2 * my2;
+    const F xy = mx0 * my0 + mx1 * my1 + mx2 * my2;
+    // Lagrange's identity: |m_x|^2 |m_y|^2 - (m_x . m_y)^2 without its cancellation.
+    const F n0 = mx1 * my2 - mx2 * my1, n1 = mx2 * my0 - mx0 * my2, n2 = mx0 * my1 - mx1 * my0;
+    const F det = n0 * n0 + n1 * n1 + n2 * n2;
+    const F blurred_xx = xx + eps2d, blurred_yy = yy + eps2d;
+    const F blurred_det = det + eps2d * (xx + yy) + eps2d * eps2d;
+"""
+"""Snippet: EWA splatting (Zwicker et al. 2001, eq. 26-31)."""
+
+FACTORS = f"""
+    const F deviation_x = sqrt_(blurred_xx), deviation_y = sqrt_(blurred_yy);
+    const F d = {SQRT_HALF_LOG2_E!r}f / deviation_y;
+    const F a = deviation_y * {SQRT_HALF_LOG2_E!r}f / sqrt_(blurred_det);
+    const F b = -a * xy / blurred_yy;
+"""
+"""Snippet: the Cholesky factor of the inverse blurred covariance, times sqrt(log2(e) / 2)."""
+
+_PROJECT = f"""
+    const int groups = (means.shape[0] + lanes_per_group - 1) / lanes_per_group;
+    const int camera = group / groups;
+    const int n = (group - camera * groups) * lanes_per_group;
+    const int left = means.shape[0] - n;
+    const int lanes = left < lanes_per_group ? left : lanes_per_group;
+    const size_t first = (size_t)camera * means.shape[0] + n;
+{PRELUDE}{CAMERA}{PINHOLE}{ROTATION}{COVARIANCE}{FACTORS}
+    const F mean_x = offset_x + cx, mean_y = offset_y + cy;
+    F compensation = splat(1.0f);
+    if (antialiased) compensation = sqrt_(det / blurred_det);
+    const F opacity = load(opacities.data + n, 1) * compensation;
+    const F log2_opacity = log2_(max_(opacity, splat(1.2e-38f)));
+    const F extent2 = log2_opacity - {LOG2_CUTOFF!r}f;
+    const F extent = sqrt_(max_(extent2, splat(0.0f)));
+    const F box_x = extent * deviation_x * {SLACK / SQRT_HALF_LOG2_E!r}f;
+    const F box_y = extent * deviation_y * {SLACK / SQRT_HALF_LOG2_E!r}f;
+
+    // Pixels whose centre lies in the box, then the tiles they lie in (end exclusive).
+    const F x0 = max_(ceil_(mean_x - box_x - 0.5f), splat(0.0f));
+    const F y0 = max_(ceil_(mean_y - box_y - 0.5f), splat(0.0f));
+    const F x1 = min_(floor_(mean_x + box_x - 0.5f), splat((float)(width - 1)));
+    const F y1 = min_(floor_(mean_y + box_y - 0.5f), splat((float)(height - 1)));
+    // A sum of magnitudes is finite only where all its terms are.
+    const F size = abs_(mean_x) + abs_(mean_y) + a + abs_(b) + d + box_x + box_y + opacity + blurred_det;
+    I drawn = (z >= near) & (z <= far) & (z > 0.0f) & (extent2 >= 0.0f) & (opacity > 0.0f) & finite(size)
+        & (x0 <= x1) & (y0 <= y1) & ((box_x > radius_clip) | (box_y > radius_clip));
+
+    const F zero = splat(0.0f);
+    F fields[16];
+    if (any(drawn)) {{
+        if (degree >= 0) {{
+{HARMONICS}
+            drawn = drawn & finite(red) & finite(green) & finite(blue);
+            fields[{CHANNELS}] = max_(red, zero);
+            fields[{CHANNELS + 1}] = max_(green, zero);
+            fields[{CHANNELS + 2}] = max_(blue, zero);
+            fields[{CHANNELS + 3}] = z;
+        }} else {{
+            const int width_ = features.shape[1];
+            const float* const feature = features.data + (first % features.shape[0]) * width_;
+            for (int i = 0; i < 4; ++i) fields[{CHANNELS} + i] = i == width_ ? z : zero;
+            for (int i = 0; i < width_; ++i) {{
+                const F value = load(feature + i, width_);
+                drawn = drawn & finite(value);
+                if (i < 4) fields[{CHANNELS} + i] = value;
+            }}
+        }}
+    }}
+    const F reach_a = a + abs_(b);
+    const F reach = (extent + 1.5f * sqrt_(reach_a * reach_a + d * d)) * {float(SLACK)!r}f;
+    fields[{MEAN}] = mean_x;
+    fields[{MEAN + 1}] = mean_y;
+    fields[{FACTOR}] = a;
+    fields[{FACTOR + 1}] = b;
+    fields[{FACTOR + 2}] = d;
+    fields[{OPACITY}] = opacity;
+    fields[{LOG2_OPACITY}] = log2_opacity;
+    fields[{DEPTH}] = z;
+    fields[{BOX}] = box_x;
+    fields[{BOX + 1}] = box_y;
+    fields[{REACH}] = reach * reach;
+    fields[{COMPENSATION}] = compensation;
+    float* const record = records_out.data + first * 16;
+    for (int i = 0; i < 16; ++i) fields[i] = select(drawn, fields[i], zero);
+    store_rows(record, 16, fields);
+    const F largest = splat(1.0e9f);
+    const I radius_x = to_int(select(drawn, min_(ceil_(box_x), largest), zero));
+    const I radius_y = to_int(select(drawn, min_(ceil_(box_y), largest), zero));
+    const F tile = splat({1 / TILE!r}f);
+    const I begin_x = to_int(select(drawn, x0 * tile, zero)), begin_y = to_int(select(drawn, y0 * tile, zero));
+    const I end_x = to_int(select(drawn, x1 * tile + 1.0f, zero));
+    const I end_y = to_int(select(drawn, y1 * tile + 1.0f, zero));
+    const F key = select(drawn, z, splat(1.0f / 0.0f));
+    store(keys_out.data + (size_t)camera * keys_out.shape[1] + n, 1, key);
+    int* const radius = (int*)(radii_out.data + first);
+    short* const rect = (short*)(rects_out.data + first);
+    int* const order = order_out.data + (size_t)camera * order_out.shape[1] + n;
+    for (int j = 0; j < lanes; ++j) {{
+        radius[2 * j] = lane_int(radius_x, j);
+        radius[2 * j + 1] = lane_int(radius_y, j);
+        rect[4 * j] = (short)lane_int(begin_x, j);
+        rect[4 * j + 1] = (short)lane_int(begin_y, j);
+        rect[4 * j + 2] = (short)lane_int(end_x, j);
+        rect[4 * j + 3] = (short)lane_int(end_y, j);
+        order[j] = (int)first + j;
+    }}
+"""
 
 
-@wp.func
-def view_rotation(viewmat: wp.mat44) -> wp.mat33:
-    return wp.mat33(
-        viewmat[0, 0], viewmat[0, 1], viewmat[0, 2],
-        viewmat[1, 0], viewmat[1, 1], viewmat[1, 2],
-        viewmat[2, 0], viewmat[2, 1], viewmat[2, 2],
-    )  # fmt: skip
-
-
-@wp.func
-def camera_point(viewmat: wp.mat44, mean: wp.vec3) -> wp.vec3:
-    return view_rotation(viewmat) * mean + wp.vec3(viewmat[0, 3], viewmat[1, 3], viewmat[2, 3])
-
-
-@wp.func
-def visible(rect: vec4s) -> bool:
-    return rect[2] > wp.int16(0)
-
-
-@wp.func
-def clear(i: int, records_out: wp.array2d[float], radii_out: wp.array[wp.vec2i], rects_out: wp.array[vec4s]):
-    """Write the record of a culled Gaussian."""
-    for j in range(RECORD):
-        records_out[i, j] = 0.0
-    radii_out[i] = wp.vec2i(0, 0)
-    rects_out[i] = vec4s(wp.int16(0))
+@wp.func_native(_PROJECT)
+def project_group(
+    group: int,
+    lanes_per_group: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    sh: wp.array2d[wp.vec3],
+    features: wp.array2d[float],
+    degree: int,
+    viewmats: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.mat33],
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    radius_clip: float,
+    eps2d: float,
+    antialiased: bool,
+    records_out: wp.array2d[float],
+    radii_out: wp.array[wp.vec2i],
+    rects_out: wp.array[vec4s],
+    keys_out: wp.array2d[float],
+    order_out: wp.array2d[int],
+): ...
 
 
 @wp.kernel
 def project(
     start: int,
     # In:
+    lanes: int,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
     scales: wp.array[wp.vec3],
     opacities: wp.array[float],
+    sh: wp.array2d[wp.vec3],
+    features: wp.array2d[float],
+    degree: int,
     viewmats: wp.array[wp.mat44],
     intrinsics: wp.array[wp.mat33],
     width: int,
@@ -125,176 +283,33 @@ def project(
     keys_out: wp.array2d[float],
     order_out: wp.array2d[int],
 ):
-    """EWA splatting (Zwicker et al. 2001, eq. 26-31) of Gaussian i % N by camera i / N."""
-    i = start + wp.tid()
-    camera = i / means.shape[0]
-    n = i - camera * means.shape[0]
-    viewmat = viewmats[camera]
-    k = intrinsics[camera]
+    """One record for each camera and Gaussian; culls what is not seen, not finite or fainter than 1/255.
 
-    keys_out[camera, n] = wp.inf
-    order_out[camera, n] = i
-
-    p = camera_point(viewmat, means[n])
-    z = p[2]
-    if not (z >= near and z <= far and z > 0.0):
-        clear(i, records_out, radii_out, rects_out)
-        return
-    offset_x = (k[0, 0] * p[0] + k[0, 1] * p[1]) / z
-    offset_y = k[1, 1] * p[1] / z
-    mean_x = offset_x + k[0, 2]
-    mean_y = offset_y + k[1, 2]
-
-    # Perspective is linearized at the mean, pulled to at most 0.15 image sizes outside the image: farther out
-    # the linearization would blow Gaussians up (as in the code of 3D Gaussian Splatting).
-    margin_x = 0.15 * float(width)
-    margin_y = 0.15 * float(height)
-    offset_x = wp.clamp(offset_x, -k[0, 2] - margin_x, float(width) - k[0, 2] + margin_x)
-    offset_y = wp.clamp(offset_y, -k[1, 2] - margin_y, float(height) - k[1, 2] + margin_y)
-    row_x = wp.vec3(k[0, 0], k[0, 1], -offset_x) / z
-    row_y = wp.vec3(0.0, k[1, 1], -offset_y) / z
-
-    # 2D covariance M M^T of the rows m_x, m_y of M = J R_view R S.
-    to_camera = wp.transpose(view_rotation(viewmat))
-    to_axes = wp.transpose(rotation_of(quats[n]))
-    m_x = wp.cw_mul(to_axes * (to_camera * row_x), scales[n])
-    m_y = wp.cw_mul(to_axes * (to_camera * row_y), scales[n])
-    xx = wp.dot(m_x, m_x)
-    yy = wp.dot(m_y, m_y)
-    xy = wp.dot(m_x, m_y)
-    # Lagrange's identity: |m_x|^2 |m_y|^2 - (m_x . m_y)^2 without its cancellation.
-    normal = wp.cross(m_x, m_y)
-    det = wp.dot(normal, normal)
-    det_blurred = det + eps2d * (xx + yy) + eps2d * eps2d
-    deviation_x = wp.sqrt(xx + eps2d)
-    deviation_y = wp.sqrt(yy + eps2d)
-
-    compensation = wp.float32(1.0)
-    if antialiased:
-        compensation = wp.sqrt(det / det_blurred)
-    opacity = opacities[n] * compensation
-    log2_opacity = wp.log2(opacity)
-    extent2 = log2_opacity - LOG2_CUTOFF
-    extent = wp.sqrt(extent2)
-
-    d = SQRT_HALF_LOG2_E / deviation_y
-    a = deviation_y * SQRT_HALF_LOG2_E / wp.sqrt(det_blurred)
-    b = -a * xy / (yy + eps2d)
-    box_x = extent * deviation_x * (SLACK / SQRT_HALF_LOG2_E)
-    box_y = extent * deviation_y * (SLACK / SQRT_HALF_LOG2_E)
-
-    # Pixels whose centre lies in the box, then the tiles they lie in (end exclusive).
-    x0 = wp.max(wp.ceil(mean_x - box_x - 0.5), 0.0)
-    y0 = wp.max(wp.ceil(mean_y - box_y - 0.5), 0.0)
-    x1 = wp.min(wp.floor(mean_x + box_x - 0.5), float(width - 1))
-    y1 = wp.min(wp.floor(mean_y + box_y - 0.5), float(height - 1))
-    # A sum of magnitudes is finite only where all its terms are.
-    size = wp.abs(mean_x) + wp.abs(mean_y) + a + wp.abs(b) + d + box_x + box_y + extent2 + det_blurred
-    drawn = extent2 >= 0.0 and wp.isfinite(size) and x0 <= x1 and y0 <= y1
-    if not drawn or (box_x <= radius_clip and box_y <= radius_clip):
-        clear(i, records_out, radii_out, rects_out)
-        return
-
-    block = 1.5 * wp.sqrt((a + wp.abs(b)) * (a + wp.abs(b)) + d * d)
-    reach = (extent + block) * SLACK
-    records_out[i, MEAN] = mean_x
-    records_out[i, MEAN + 1] = mean_y
-    records_out[i, FACTOR] = a
-    records_out[i, FACTOR + 1] = b
-    records_out[i, FACTOR + 2] = d
-    records_out[i, OPACITY] = opacity
-    records_out[i, LOG2_OPACITY] = log2_opacity
-    records_out[i, DEPTH] = z
-    records_out[i, BOX] = box_x
-    records_out[i, BOX + 1] = box_y
-    records_out[i, REACH] = reach * reach
-    records_out[i, COMPENSATION] = compensation
-    radii_out[i] = wp.vec2i(int(wp.min(wp.ceil(box_x), 1.0e9)), int(wp.min(wp.ceil(box_y), 1.0e9)))
-    rects_out[i] = vec4s(
-        wp.int16(int(x0) / TILE),
-        wp.int16(int(y0) / TILE),
-        wp.int16(int(x1) / TILE + 1),
-        wp.int16(int(y1) / TILE + 1),
+    Channels are max(0, SH(direction from the camera) + 0.5) and depth where degree >= 0; else the first four
+    of features and depth, row i % rows. `lanes` is 16 on a CPU and 1 on a GPU.
+    """
+    project_group(
+        start + wp.tid(),
+        lanes,
+        means,
+        quats,
+        scales,
+        opacities,
+        sh,
+        features,
+        degree,
+        viewmats,
+        intrinsics,
+        width,
+        height,
+        near,
+        far,
+        radius_clip,
+        eps2d,
+        antialiased,
+        records_out,
+        radii_out,
+        rects_out,
+        keys_out,
+        order_out,
     )
-    keys_out[camera, n] = z
-
-
-@wp.kernel
-def shade_harmonics(
-    start: int,
-    # In:
-    means: wp.array[wp.vec3],
-    sh: wp.array2d[wp.vec3],
-    degree: int,
-    viewmats: wp.array[wp.mat44],
-    # Out:
-    records_out: wp.array2d[float],
-    radii_out: wp.array[wp.vec2i],
-    rects_out: wp.array[vec4s],
-):
-    """Channels = max(0, SH(direction from the camera) + 0.5), depth. Culls where the colour is not finite."""
-    i = start + wp.tid()
-    if not visible(rects_out[i]):
-        return
-    camera = i / means.shape[0]
-    n = i - camera * means.shape[0]
-    # R^T (R x + t) = x - camera centre, for a rigid view matrix.
-    p = camera_point(viewmats[camera], means[n])
-    direction = wp.normalize(wp.transpose(view_rotation(viewmats[camera])) * p)
-    rgb = harmonics_sum(sh, n, degree, direction) + wp.vec3(0.5, 0.5, 0.5)
-    if not (wp.isfinite(rgb)):
-        clear(i, records_out, radii_out, rects_out)
-        return
-    for j in range(3):
-        records_out[i, CHANNELS + j] = wp.max(rgb[j], 0.0)
-    records_out[i, CHANNELS + 3] = p[2]
-
-
-@wp.kernel
-def shade_features(
-    start: int,
-    # In:
-    features: wp.array2d[float],
-    # Out:
-    records_out: wp.array2d[float],
-    radii_out: wp.array[wp.vec2i],
-    rects_out: wp.array[vec4s],
-):
-    """Channels = the first four of features and depth, row i % rows. Culls where a feature is not finite."""
-    i = start + wp.tid()
-    if not visible(rects_out[i]):
-        return
-    row = i % features.shape[0]
-    for j in range(features.shape[1]):
-        value = features[row, j]
-        if not (wp.isfinite(value)):
-            clear(i, records_out, radii_out, rects_out)
-            return
-        if j < 4:
-            records_out[i, CHANNELS + j] = value
-    if features.shape[1] < 4:
-        records_out[i, CHANNELS + features.shape[1]] = records_out[i, DEPTH]
-
-
-@wp.kernel
-def pack_channels(
-    start: int,
-    # In:
-    features: wp.array2d[float],
-    records: wp.array2d[float],
-    rects: wp.array[vec4s],
-    first: int,
-    # Out:
-    channels_out: wp.array2d[float],
-):
-    """Channels first .. first + 3 of features followed by depth; past the end, zeros."""
-    i = start + wp.tid()
-    row = i % features.shape[0]
-    for j in range(4):
-        value = wp.float32(0.0)
-        if visible(rects[i]):
-            if first + j < features.shape[1]:
-                value = features[row, first + j]
-            elif first + j == features.shape[1]:
-                value = records[i, DEPTH]
-        channels_out[i, j] = value

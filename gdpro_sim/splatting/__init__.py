@@ -1,5 +1,6 @@
 """Image formation: Gaussians and cameras in, colour, alpha and depth images out."""
 
+from gdpro_sim.splatting.contributions import contributions
 from gdpro_sim.splatting.rasterization import RasterOptions, rasterization
 
-__all__ = ["RasterOptions", "rasterization"]
+__all__ = ["RasterOptions", "contributions", "rasterization"]

@@ -18,7 +18,7 @@ def check_tensor(
 ) -> torch.Tensor:
     """Return `value` as a contiguous float32 tensor of `shape`; strings in `shape` stand for any size.
 
-    Raises ValueError where it is not one, lies on another device than `like`, or requires grad.
+    Raises ValueError where it is not one or lies on another device than `like`.
     """
     wanted = "[" + ", ".join(str(s) for s in shape) + "]"
     if not isinstance(value, torch.Tensor):
@@ -33,10 +33,6 @@ def check_tensor(
         raise ValueError(f"{name} must be torch.float32, got {value.dtype}; convert it with .float()")
     if like is not None and value.device != like.device:
         raise ValueError(f"{name} must be on the device of means, {like.device}, got {value.device}")
-    if value.requires_grad:
-        raise ValueError(
-            f"{name} requires grad, but rasterization has no gradients yet; pass {name}.detach()"
-        )
     return value.contiguous()
 
 
@@ -71,4 +67,41 @@ def check_count(what: str, count: int, limit: int = INDEX_LIMIT) -> int:
     return count
 
 
-__all__ = ["INDEX_LIMIT", "check_choice", "check_count", "check_number", "check_size", "check_tensor"]
+GSPLAT_ARGUMENTS: dict[str, tuple[object, ...]] = {
+    "packed": (False,),
+    "tile_size": (16,),
+    "sparse_grad": (False,),
+    "distributed": (False,),
+    "camera_model": ("pinhole",),
+    "segmented": (False,),
+    "covars": (None,),
+    "with_ut": (False,),
+    "with_eval3d": (False,),
+}
+"""gsplat's arguments that have one meaning here, and the values that ask for it."""
+
+
+def check_gsplat_arguments(arguments: dict[str, object]) -> None:
+    """Accept gsplat's other arguments where they ask for what is done anyway.
+
+    Raises ValueError where they ask for something else, TypeError where gsplat has no such argument.
+    """
+    for name, value in arguments.items():
+        if name == "channel_chunk":  # how many channels at once changes no result
+            continue
+        if name not in GSPLAT_ARGUMENTS:
+            raise TypeError(f"rasterization got an unexpected argument {name!r}")
+        if not any(type(value) is type(allowed) and value == allowed for allowed in GSPLAT_ARGUMENTS[name]):
+            allowed = " or ".join(repr(a) for a in GSPLAT_ARGUMENTS[name])
+            raise ValueError(f"{name} must be {allowed}, the only choice here, got {value!r}")
+
+
+__all__ = [
+    "INDEX_LIMIT",
+    "check_choice",
+    "check_count",
+    "check_gsplat_arguments",
+    "check_number",
+    "check_size",
+    "check_tensor",
+]

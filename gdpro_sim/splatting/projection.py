@@ -8,8 +8,9 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked
+from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.kernels import projection as kernels
+from gdpro_sim.kernels import projection_backward
 from gdpro_sim.kernels.projection import vec4s
 
 
@@ -38,26 +39,30 @@ class View:
 class Projection:
     """C x N projected Gaussians; M = C N, record c N + n is Gaussian n seen by camera c.
 
-    records: [M, 16] float32, see `gdpro_sim.kernels.projection`; zeros where culled
+    records: [M, 16] float32, see `gdpro_sim.kernels.projection`; zeros where culled. Its depths, opacities and
+             factors carry gradients, its channels too; its means do not: `means2d` does
+    means2d: [C, N, 2] pixels
     radii:   [M, 2] int32, half extents in pixels of the box outside which alpha < 1/255; zeros where culled
     rects:   [M, 4] int16, tiles touched: x begin, y begin, x end, y end (exclusive); zeros where culled
     order:   [C, 2 N] int32, of which order[:, :N] are record numbers in ascending depth, culled ones last
     """
 
     records: torch.Tensor
+    means2d: torch.Tensor
     radii: torch.Tensor
     rects: torch.Tensor
     order: torch.Tensor
-    cameras: int
-    gaussians: int
+
+    @property
+    def cameras(self) -> int:
+        return int(self.means2d.shape[0])
+
+    @property
+    def gaussians(self) -> int:
+        return int(self.means2d.shape[1])
 
     def _field(self, first: int, width: int) -> torch.Tensor:
         return self.records.view(self.cameras, self.gaussians, kernels.RECORD)[..., first : first + width]
-
-    @property
-    def means2d(self) -> torch.Tensor:
-        """[C, N, 2] pixels, a view of the records."""
-        return self._field(kernels.MEAN, 2)
 
     @property
     def depths(self) -> torch.Tensor:
@@ -81,7 +86,12 @@ def array(tensor: torch.Tensor, dtype: type) -> Any:
 
     It keeps the tensor alive.
     """
-    return wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def lanes_of(tensor: torch.Tensor) -> int:
+    """How many Gaussians a kernel works on at once, see `gdpro_sim.kernels.lanes`."""
+    return 16 if tensor.device.type == "cpu" else 1
 
 
 def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int = 32) -> None:
@@ -92,106 +102,162 @@ def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int =
 
 
 def project(
-    means: torch.Tensor, quats: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, view: View
+    gaussians: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
+    colors: torch.Tensor,
+    degree: int | None,
+    view: View,
 ) -> Projection:
-    """Project N >= 1 Gaussians into C >= 1 cameras and sort each camera's by depth; leaves out channels."""
-    cameras, count = len(view.viewmats), len(means)
-    total = cameras * count
-    device = device_name(means)
-    records = means.new_empty((total, int(kernels.RECORD)))
-    radii = means.new_empty((total, 2), dtype=torch.int32)
-    rects = means.new_empty((total, 4), dtype=torch.int16)
-    keys = means.new_empty((cameras, 2 * count))
-    order = means.new_empty((cameras, 2 * count), dtype=torch.int32)
-    launch_chunked(
-        kernels.project,
-        total,
-        [
-            array(means, wp.vec3),
-            array(quats, wp.vec4),
-            array(scales, wp.vec3),
-            array(opacities, wp.float32),
-            array(view.viewmats, wp.mat44),
-            array(view.Ks, wp.mat33),
-            view.width,
-            view.height,
-            view.near,
-            view.far,
-            view.radius_clip,
-            view.eps2d,
-            view.antialiased,
-        ],
-        [
-            array(records, wp.float32),
-            array(radii, wp.vec2i),
-            array(rects, vec4s),
-            array(keys, wp.float32),
-            array(order, wp.int32),
-        ],
-        device=device,
-    )
-    for camera in range(cameras):
-        sort_pairs(keys[camera], order[camera], count)
-    return Projection(records, radii, rects, order, cameras, count)
+    """Project N >= 1 Gaussians (means, quats, scales, opacities) into C >= 1 cameras; sort each camera's by depth.
+
+    The first four channels of the records are colour and depth from `colors` [N, K, 3] of spherical harmonics
+    where `degree` is given, else the first four of (`colors` [N or C N, D], depth), D >= 0.
+    """
+    no_harmonics, no_features = colors.new_empty((0, 1, 3)), colors.new_empty((0, 1))
+    sh, features = (no_harmonics, colors) if degree is None else (colors, no_features)
+    result = _Project.apply(*gaussians, sh, features, view.viewmats, view.Ks, degree, view)
+    return Projection(*result)
 
 
-def shade_harmonics(
-    projection: Projection, means: torch.Tensor, sh: torch.Tensor, degree: int, view: View
-) -> None:
-    """Set channels 0-2 from spherical harmonics [N, K, 3] and channel 3 to depth; cull where not finite."""
-    launch_chunked(
-        kernels.shade_harmonics,
-        len(projection.records),
-        [array(means, wp.vec3), array(sh, wp.vec3), degree, array(view.viewmats, wp.mat44)],
-        _culled(projection),
-        device=device_name(means),
-    )
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: torch.Tensor,
+        quats: torch.Tensor,
+        scales: torch.Tensor,
+        opacities: torch.Tensor,
+        sh: torch.Tensor,
+        features: torch.Tensor,
+        viewmats: torch.Tensor,
+        Ks: torch.Tensor,
+        degree: int | None,
+        view: View,
+    ) -> tuple[torch.Tensor, ...]:
+        cameras, count = len(viewmats), len(means)
+        total = cameras * count
+        records = means.new_empty((total, int(kernels.RECORD)))
+        radii = means.new_empty((total, 2), dtype=torch.int32)
+        rects = means.new_empty((total, 4), dtype=torch.int16)
+        keys = means.new_empty((cameras, 2 * count))
+        order = means.new_empty((cameras, 2 * count), dtype=torch.int32)
+        lanes = lanes_of(means)
+        launch_chunked(
+            kernels.project,
+            cameras * -(-count // lanes),
+            [
+                lanes,
+                array(means, wp.vec3),
+                array(quats, wp.vec4),
+                array(scales, wp.vec3),
+                array(opacities, wp.float32),
+                array(sh, wp.vec3),
+                array(features, wp.float32),
+                -1 if degree is None else degree,
+                array(viewmats, wp.mat44),
+                array(Ks, wp.mat33),
+                view.width,
+                view.height,
+                view.near,
+                view.far,
+                view.radius_clip,
+                view.eps2d,
+                view.antialiased,
+            ],
+            [
+                array(records, wp.float32),
+                array(radii, wp.vec2i),
+                array(rects, vec4s),
+                array(keys, wp.float32),
+                array(order, wp.int32),
+            ],
+            device=device_name(means),
+            minimum=64,
+        )
+        for camera in range(cameras):
+            sort_pairs(keys[camera], order[camera], count)
+        means2d = records.view(cameras, count, -1)[..., :2].contiguous()
+        ctx.save_for_backward(means, quats, scales, opacities, sh, features, viewmats, Ks, rects)
+        ctx.degree, ctx.view = degree, view
+        ctx.mark_non_differentiable(radii, rects, order)
+        ctx.set_materialize_grads(False)
+        return records, means2d, radii, rects, order
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        g_records, g_means2d = gradients[:2]
+        means, quats, scales, opacities, sh, features, viewmats, Ks, rects = ctx.saved_tensors
+        if g_records is None and g_means2d is None:
+            return (None,) * 10
+        view: View = ctx.view
+        cameras, total = len(viewmats), len(rects)
+        if g_records is None:
+            g_records = means.new_zeros((total, int(kernels.RECORD)))
+        if g_means2d is None:
+            g_means2d = means.new_zeros((total, 2))
+        g_means, g_quats = torch.empty_like(means), torch.empty_like(quats)
+        g_scales, g_opacities = torch.empty_like(scales), torch.empty_like(opacities)
+        whole = ctx.degree is None or (ctx.degree + 1) ** 2 == sh.shape[1]
+        g_sh = torch.empty_like(sh) if whole else torch.zeros_like(sh)
+        g_features = torch.empty_like(features) if features.shape[1] <= 4 else torch.zeros_like(features)
+        with_cameras = bool(ctx.needs_input_grad[6] or ctx.needs_input_grad[7])
+        lanes = lanes_of(means)
+        groups = -(-len(means) // lanes)
+        groups_per_run = 64 if lanes > 1 or with_cameras else 1
+        runs = -(-groups // groups_per_run)
+        g_cameras = means.new_zeros(
+            (runs if with_cameras else 0, cameras, projection_backward.CAMERA_GRADIENTS)
+        )
+        with torch_stream(means):
+            launch_chunked(
+                projection_backward.project_backward,
+                runs,
+                [
+                    groups_per_run,
+                    lanes,
+                    array(means, wp.vec3),
+                    array(quats, wp.vec4),
+                    array(scales, wp.vec3),
+                    array(opacities, wp.float32),
+                    array(sh, wp.vec3),
+                    -1 if ctx.degree is None else ctx.degree,
+                    array(viewmats, wp.mat44),
+                    array(Ks, wp.mat33),
+                    view.width,
+                    view.height,
+                    view.eps2d,
+                    view.antialiased,
+                    with_cameras,
+                    array(rects, vec4s),
+                    array(g_records.contiguous(), wp.float32),
+                    array(g_means2d.reshape(total, 2).contiguous(), wp.float32),
+                ],
+                [
+                    array(g_means, wp.vec3),
+                    array(g_quats, wp.vec4),
+                    array(g_scales, wp.vec3),
+                    array(g_opacities, wp.float32),
+                    array(g_sh, wp.vec3),
+                    array(g_features, wp.float32),
+                    array(g_cameras, wp.float32),
+                ],
+                device=device_name(means),
+                minimum=1,
+            )
+        g_viewmats, g_Ks = camera_gradients(g_cameras) if with_cameras else (None, None)
+        return g_means, g_quats, g_scales, g_opacities, g_sh, g_features, g_viewmats, g_Ks, None, None
 
 
-def shade_features(projection: Projection, features: torch.Tensor) -> None:
-    """Set the first four of (features [N or C N, D], depth) as channels; cull what is not finite."""
-    launch_chunked(
-        kernels.shade_features,
-        len(projection.records),
-        [array(features, wp.float32)],
-        _culled(projection),
-        device=device_name(features),
-    )
+def camera_gradients(sums: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Partial sums [runs, C, 17] of `projection_backward` -> gradients [C, 4, 4] and [C, 3, 3]."""
+    # A cumulative sum goes in order, a sum as it likes.
+    total = torch.cumsum(sums.double(), 0)[-1].float()
+    g_viewmats = total.new_zeros((len(total), 4, 4))
+    g_viewmats[:, :3, :3] = total[:, :9].view(-1, 3, 3)
+    g_viewmats[:, :3, 3] = total[:, 9:12]
+    g_Ks = total.new_zeros((len(total), 3, 3))
+    g_Ks[:, 0] = total[:, 12:15]
+    g_Ks[:, 1, 1:] = total[:, 15:17]
+    return g_viewmats, g_Ks
 
 
-def pack_channels(projection: Projection, features: torch.Tensor, first: int) -> torch.Tensor:
-    """Entries first .. first + 3 of (features [N or C N, D], depth), zero past the end: [M, 4]."""
-    channels = features.new_empty((len(projection.records), 4))
-    launch_chunked(
-        kernels.pack_channels,
-        len(channels),
-        [
-            array(features, wp.float32),
-            array(projection.records, wp.float32),
-            array(projection.rects, vec4s),
-            first,
-        ],
-        [array(channels, wp.float32)],
-        device=device_name(features),
-    )
-    return channels
-
-
-def _culled(projection: Projection) -> list[Any]:
-    return [
-        array(projection.records, wp.float32),
-        array(projection.radii, wp.vec2i),
-        array(projection.rects, vec4s),
-    ]
-
-
-__all__ = [
-    "Projection",
-    "View",
-    "array",
-    "pack_channels",
-    "project",
-    "shade_features",
-    "shade_harmonics",
-    "sort_pairs",
-]
+__all__ = ["Projection", "View", "array", "camera_gradients", "lanes_of", "project", "sort_pairs"]

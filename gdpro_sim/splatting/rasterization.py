@@ -12,18 +12,14 @@ from gdpro_sim.splatting.checks import (
     INDEX_LIMIT,
     check_choice,
     check_count,
+    check_gsplat_arguments,
     check_number,
     check_size,
     check_tensor,
 )
-from gdpro_sim.splatting.compositing import Composite, composite
-from gdpro_sim.splatting.projection import (
-    Projection,
-    View,
-    project,
-    shade_features,
-    shade_harmonics,
-)
+from gdpro_sim.splatting.compositing import Blending, Composite, blend, composite
+from gdpro_sim.splatting.normals import shortest_axes
+from gdpro_sim.splatting.projection import Projection, View, project
 from gdpro_sim.splatting.tiles import TileLists, count_and_fill, empty_lists, expand_and_sort
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -39,10 +35,12 @@ class RasterOptions:
                       runs; on a CPU slow, for comparison) or "auto", the one made for the device
     max_tile_entries: most (tile, Gaussian) pairs to make; more raise RequestError before memory is taken
                       (4 bytes each on a CPU, 16 on a GPU)
+    normals:          also blend normals, into `meta["normals"]`
     """
 
     method: str = "auto"
     max_tile_entries: int = INDEX_LIMIT
+    normals: bool = False
 
     def __post_init__(self) -> None:
         check_choice("RasterOptions.method", self.method, METHODS)
@@ -72,14 +70,17 @@ def rasterization(
     sh_degree: int | None = None,
     backgrounds: torch.Tensor | None = None,
     render_mode: str = "RGB",
+    absgrad: bool = False,
     rasterize_mode: str = "classic",
     options: RasterOptions | None = None,
+    **gsplat: Any,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Render N 3D Gaussians into C cameras, with gsplat's names and conventions.
 
     All tensors are float32 on one device, CPU or CUDA, which decides where the work is done; memory is shared
-    with Warp, not copied. On a CPU the result is the same to the bit for any number of threads. There are no
-    gradients yet.
+    with Warp, not copied. On a CPU images and gradients are the same to the bit for any number of threads.
+    Gradients flow to means, quats, scales, opacities, colors, viewmats (its upper three rows, as free numbers),
+    Ks and backgrounds; there is none where alpha is limited to 0.99, a colour to 0, or a Gaussian not drawn.
 
     means      [N, 3] metres
     quats      [N, 4] wxyz, any length but zero
@@ -97,23 +98,30 @@ def rasterization(
     backgrounds  [C, D] colour behind everything; never added to depth
     render_mode  "RGB" (colours or features), "D" (sum of weight times depth), "ED" (that over alpha: expected
                depth), "RGB+D", "RGB+ED" (depth as last channel). Depth is z of centres, in metres
+    absgrad    gsplat's: backward leaves the sum over pixels of absolute gradients at means2d, in pixels, in
+               `meta["means2d"].absgrad` [C, N, 2] (with more than 4 channels, of sums over 4 at a time)
     rasterize_mode  "classic", or "antialiased": opacity times sqrt(det covariance / det blurred covariance)
+    gsplat     gsplat's other arguments, with the values that mean what is done here: packed=False,
+               tile_size=16, sparse_grad=False, distributed=False, camera_model="pinhole", any channel_chunk
 
     Returns colours [C, H, W, D], alphas [C, H, W, 1] and a dict with
         width, height, tile_size, tile_width, tile_height, n_cameras  numbers
         means2d [C, N, 2], depths [C, N], opacities [C, N], radii [C, N, 2] (pixels; zero where not drawn)
         isect_offsets [C, tile_height, tile_width], flatten_ids [E]  tile lists: Gaussian c N + n, by depth
         transmittance [C, H, W]                                      what reaches the background
-        projection, tile_lists, composite                            the stages' own results
+        normals [C, H, W, 3], with RasterOptions(normals=True)       sum of weight times the Gaussian's shortest
+                                                                     axis, in world space, towards the camera
+        projection, tile_lists, composite, blending                  the stages' own results
+    means2d, depths, opacities and normals carry gradients; `means2d.retain_grad()` works as with gsplat.
 
     A Gaussian is not drawn where its parameters or colour hold NaN or infinity, or its quaternion is zero.
-    Raises ValueError where an argument is malformed or requires grad, and RequestError where counts do not
-    fit 32-bit indices.
+    Raises ValueError where an argument is malformed, and RequestError where counts do not fit 32-bit indices.
 
     Source: Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023); projection
     from Zwicker et al., "EWA Splatting" (2002); antialiasing from Yu et al., "Mip-Splatting" (2024), eq. 9.
     """
     options = RasterOptions() if options is None else options
+    check_gsplat_arguments(gsplat)
     means = check_tensor("means", means, ("N", 3))
     count = len(means)
     quats = check_tensor("quats", quats, (count, 4), means)
@@ -140,9 +148,9 @@ def rasterization(
     channels = features + with_depth
     background = means.new_zeros((cameras, channels))
     if backgrounds is not None:
-        background[:, :features] = check_tensor(
-            "backgrounds", backgrounds, (cameras, colors.shape[-1]), means
-        )[:, :features]
+        width_ = features or (3 if sh_degree is not None else colors.shape[-1])
+        backgrounds = check_tensor("backgrounds", backgrounds, (cameras, width_), means)
+        background = torch.cat([backgrounds[:, :features], background[:, features:]], dim=1)
     divided = channels - 1 if render_mode.endswith("ED") else -1
 
     columns, rows = view.tiles
@@ -157,19 +165,16 @@ def rasterization(
             f'RasterOptions.method "tile" runs on the CPU only; the tensors are on {means.device}'
         )
 
-    drawn = colors if with_colors else means.new_empty((count, 0))
+    drawn, degree = (colors, sh_degree) if with_colors else (means.new_empty((count, 0)), None)
+    flat = drawn if degree is not None else drawn.flatten(0, -2)
+    gaussians = (means, quats, scales, opacities)
     with torch_stream(means):
-        projection, lists, result = _render(
-            (means, quats, scales, opacities),
-            drawn,
-            sh_degree if with_colors else None,
-            background,
-            divided,
-            view,
-            options.max_tile_entries,
-            tile=tile,
+        projection, lists = _project_and_bin(
+            gaussians, flat, degree, view, options.max_tile_entries, tile=tile
         )
-    meta = {
+        result = composite(projection, lists, flat, background, divided, view, tile=tile, absgrad=absgrad)
+    blending = Blending(view, 3, -1, tile, absgrad)
+    meta: dict[str, Any] = {
         "width": width,
         "height": height,
         "tile_size": 16,
@@ -186,40 +191,39 @@ def rasterization(
         "projection": projection,
         "tile_lists": lists,
         "composite": result,
+        "blending": blending,
     }
+    if options.normals:
+        axes = torch.nn.functional.pad(shortest_axes(means, quats, scales, viewmats), (0, 1)).flatten(0, 1)
+        with torch_stream(means):
+            nothing = means.new_zeros((cameras, 3))
+            meta["normals"] = blend(projection, lists, axes, nothing, blending).image
     return result.image, result.alphas, meta
 
 
-def _render(
+def _project_and_bin(
     gaussians: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
     colors: torch.Tensor,
-    sh_degree: int | None,
-    background: torch.Tensor,
-    divided: int,
+    degree: int | None,
     view: View,
     limit: int,
     *,
     tile: bool,
-) -> tuple[Projection, TileLists, Composite]:
-    """The three stages over checked arguments; `colors` [N, K, 3], or [N, F] or [C, N, F] with F >= 0."""
+) -> tuple[Projection, TileLists]:
+    """The first two stages over checked arguments; `colors` [N, K, 3], or [N or C N, F] with F >= 0."""
     means = gaussians[0]
     cameras, count = len(view.viewmats), len(means)
-    if cameras == 0:
-        lists = empty_lists(0, view, means.device)
-        return _nothing(0, count, means), lists, _no_images(view, background.shape[1], means)
-    flat = None if sh_degree is not None else colors.flatten(0, -2)
-    if count == 0:
-        projection = _nothing(cameras, 0, means)
-        lists = empty_lists(cameras, view, means.device)
-    else:
-        projection = project(*gaussians, view)
-        if flat is None:
-            assert sh_degree is not None
-            shade_harmonics(projection, means, colors, sh_degree, view)
-        else:
-            shade_features(projection, flat)
-        lists = (count_and_fill if tile else expand_and_sort)(projection, view, limit)
-    return projection, lists, composite(projection, lists, flat, background, divided, view, tile=tile)
+    if cameras * count == 0:
+        nothing = Projection(
+            means.new_zeros((0, 16)),
+            means.new_zeros((cameras, count, 2)),
+            means.new_zeros((0, 2), dtype=torch.int32),
+            means.new_zeros((0, 4), dtype=torch.int16),
+            means.new_zeros((cameras, 0), dtype=torch.int32),
+        )
+        return nothing, empty_lists(cameras, view, means.device)
+    projection = project(gaussians, colors, degree, view)
+    return projection, (count_and_fill if tile else expand_and_sort)(projection, view, limit)
 
 
 def _check_colors(
@@ -242,27 +246,6 @@ def _check_colors(
             f"got shape {list(colors.shape)}"
         )
     return colors
-
-
-def _nothing(cameras: int, count: int, means: torch.Tensor) -> Projection:
-    total = cameras * count
-    return Projection(
-        means.new_zeros((total, 16)),
-        means.new_zeros((total, 2), dtype=torch.int32),
-        means.new_zeros((total, 4), dtype=torch.int16),
-        means.new_zeros((cameras, 2 * count), dtype=torch.int32),
-        cameras,
-        count,
-    )
-
-
-def _no_images(view: View, channels: int, means: torch.Tensor) -> Composite:
-    return Composite(
-        means.new_zeros((0, view.height, view.width, channels)),
-        means.new_zeros((0, view.height, view.width, 1)),
-        means.new_zeros((0, view.height, view.width)),
-        means.new_zeros(0, dtype=torch.int32),
-    )
 
 
 __all__ = ["RasterOptions", "rasterization"]

@@ -1,0 +1,380 @@
+"""Gradients of `gdpro_sim.kernels.compositing`, front to back again over the same lists.
+
+With weight w_i = alpha_i T_i, colour c_i and the image's gradient g, and with
+
+    q_i = c_i . g                                       gradient at w_i
+    R_i = sum over j > i of w_j q_j + T_end (background . g - g_alpha)     what lies behind i
+
+the gradient at alpha_i is T_i q_i - R_i / (1 - alpha_i). R starts as image . g - T_end g_alpha and loses
+w_i q_i at every Gaussian. Sums over a tile's pixels stay in registers and are added once to the Gaussian's
+gradient, laid out like its record: MEAN, FACTOR, LOG2_OPACITY, CHANNELS, and in place of BOX the sums over
+pixels of the absolute gradient at MEAN (of `absgrad`, Ye et al., "AbsGS", 2024).
+"""
+
+import warp as wp
+
+from gdpro_sim.kernels.compositing import (
+    ADVANCE,
+    ALPHA_MAX,
+    BLEND,
+    ENTRY,
+    EXP2,
+    LN2,
+    LOCATE_PIXEL,
+    LOCATE_TILE,
+    POWER,
+    TILE_LANES,
+)
+from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
+from gdpro_sim.kernels.projection import (
+    BOX,
+    CHANNELS,
+    FACTOR,
+    LOG2_CUTOFF,
+    LOG2_OPACITY,
+    MEAN,
+    RECORD,
+    vec4s,
+)
+from gdpro_sim.kernels.slabs import IN_SLAB
+
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        "max_unroll": 0,
+        "default_grid_stride": False,
+        "cpu_compiler_flags": CPU_FLAGS,
+    }
+)
+
+SPILL = """
+        // Lane i of `sum` belongs to number i of the Gaussian's gradient.
+        float* out;
+        if (whole || in_slab((int)g)) {
+            out = sums_out.data + g * WIDTH;
+        } else {
+            spill_ids_out.data[spill] = (int)g;
+            out = spills_out.data + (size_t)spill * WIDTH;
+            for (int i = 0; i < WIDTH; ++i) out[i] = 0.0f;
+            ++spill;
+        }
+"""
+"""CPU snippet: Gaussian `g` -> where its sums of this tile go (see `gdpro_sim.kernels.slabs`)."""
+
+_PIXEL_GRADIENT = """
+                // An expected depth s / alpha counts as s with a gradient at alpha of its own.
+                float behind = 0.0f, on_alpha = g_alphas.data ? g_alphas.data[pixel] : 0.0f;
+                for (int i = 0; i < count; ++i) {
+                    float g = g_image.data[pixel * count + i];
+                    const float value = image.data[pixel * count + i];
+                    behind += value * g;
+                    if (i == divided) {
+                        const float alpha = 1.0f - transmittance.data[pixel];
+                        if (alpha > 1e-10f) on_alpha -= g * value / alpha;
+                        g /= alpha > 1e-10f ? alpha : 1e-10f;
+                    }
+                    gradient[i] = g;
+                }
+                behind -= transmittance.data[pixel] * on_alpha;
+"""
+"""Snippet: `pixel` -> gradient[i] at its sums and `behind`, the first R."""
+
+_TILE = f"""
+#if !defined(__CUDACC__)
+{LOCATE_TILE}{TILE_LANES}{SUM_LANES}{IN_SLAB}
+    const bool whole = slab_begin == 0 && slab_end == offsets.shape[0] - 1;
+    int spill = whole ? 0 : spill_begins.data[tile];
+    F R[16], g0[16], g1[16], g2[16], g3[16];
+    for (int k = 0; k < 16; ++k) R[k] = g0[k] = g1[k] = g2[k] = g3[k] = zero;
+    for (int y = 0; y < y_end; ++y) {{
+        for (int x = 0; x < x_end; ++x) {{
+            const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
+            const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
+            float gradient[4] = {{0.0f, 0.0f, 0.0f, 0.0f}};
+{_PIXEL_GRADIENT}
+            R[k][lane] = behind;
+            g0[k][lane] = gradient[0];
+            g1[k][lane] = gradient[1];
+            g2[k][lane] = gradient[2];
+            g3[k][lane] = gradient[3];
+        }}
+    }}
+
+    float ub[16] __attribute__((aligned(64))), vb[16] __attribute__((aligned(64)));
+    float xb[16] __attribute__((aligned(64))), yb[16] __attribute__((aligned(64)));
+    const float* const record = records.data;
+    const float* const colour = channels.data + channel_offset;
+    const int channel_stride = channels.shape[1];
+    const int* const id = ids.data;
+    const int end = stops.data[tile];
+    const int WIDTH = {RECORD};
+    // Factors of the chain rule that all lanes share: exp2 and squares, see below.
+    const float s = {2 * LN2!r}f;
+    const F factors = {{s, s, s, s, s, s, s, s, 1, 1, 1, 1, s, s, s, s}};
+    for (int at = begin; at < end; ++at) {{
+{ENTRY}
+        *(F*)xb = bx;
+        *(F*)yb = by;
+        F sum_p = zero, sum_u = zero, sum_v = zero, sum_ux = zero, sum_uy = zero, sum_vy = zero;
+        F sum_0 = zero, sum_1 = zero, sum_2 = zero, sum_3 = zero, abs_x = zero, abs_y = zero;
+        do {{
+            const int k = __builtin_ctz(mask);
+            mask &= mask - 1;
+{POWER}{EXP2}{BLEND}
+            F q = fma((F)r0, g0[k], fma((F)r1, g1[k], r2 * g2[k]));
+            if (count > 3) q = fma((F)r3, g3[k], q);
+            const F behind = fma(-w, q, R[k]);
+            R[k] = behind;
+            const F g_alpha = fma(t, q, -behind / (1.0f - alpha));
+            const F g_p = (blend & (raw <= {float(ALPHA_MAX)!r}f)) ? g_alpha * raw : zero;
+            const F g_u = g_p * u, g_v = g_p * v;
+            sum_p += g_p;
+            sum_u += g_u;
+            sum_v += g_v;
+            sum_ux = fma((F)xb[k], g_u, sum_ux);
+            sum_uy = fma((F)yb[k], g_u, sum_uy);
+            sum_vy = fma((F)yb[k], g_v, sum_vy);
+            sum_0 = fma(w, g0[k], sum_0);
+            sum_1 = fma(w, g1[k], sum_1);
+            sum_2 = fma(w, g2[k], sum_2);
+            if (count > 3) sum_3 = fma(w, g3[k], sum_3);
+            if (absolute) {{
+                abs_x += __builtin_elementwise_abs(a * g_u);
+                abs_y += __builtin_elementwise_abs(fma((F)b, g_u, d * g_v));
+            }}
+{ADVANCE}
+        }} while (mask);
+{SPILL}
+        // p = l - u^2 - v^2, u = a dx + b dy, v = d dy, where dx, dy are block offset plus lane offset.
+        const F sums[16] = {{
+            a * sum_u, fma((F)b, sum_u, d * sum_v),
+            -fma(column, sum_u, sum_ux), -fma(row, sum_u, sum_uy), -fma(row, sum_v, sum_vy),
+            zero, 0.5f * sum_p, zero, sum_0, sum_1, sum_2, sum_3, abs_x, abs_y, zero, zero,
+        }};
+        F total;
+        __builtin_memcpy(&total, out, 64);
+        total += sum_lanes(sums) * factors;
+        __builtin_memcpy(out, &total, 64);
+    }}
+#endif
+"""
+
+
+@wp.func_native(_TILE)
+def tile_backward(
+    tile: int,
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    count: int,
+    divided: int,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    rects: wp.array[vec4s],
+    slab_begin: int,
+    slab_end: int,
+    spill_begins: wp.array[int],
+    sums_out: wp.array2d[float],
+    spill_ids_out: wp.array[int],
+    spills_out: wp.array2d[float],
+): ...
+
+
+@wp.kernel
+def composite_tile_backward(
+    start: int,
+    # In:
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    count: int,
+    divided: int,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    rects: wp.array[vec4s],
+    slab_begin: int,
+    slab_end: int,
+    spill_begins: wp.array[int],
+    # Out:
+    sums_out: wp.array2d[float],
+    spill_ids_out: wp.array[int],
+    spills_out: wp.array2d[float],
+):
+    """Add one tile's gradients of records to `sums_out` or its spills; `image` and on from the forward pass.
+
+    `g_alphas` may be empty: zero. Sums of absolute gradients where `absolute`.
+    """
+    tile_backward(
+        start + wp.tid(),
+        records,
+        channels,
+        channel_offset,
+        offsets,
+        ids,
+        stops,
+        width,
+        height,
+        count,
+        divided,
+        absolute,
+        image,
+        transmittance,
+        g_image,
+        g_alphas,
+        rects,
+        slab_begin,
+        slab_end,
+        spill_begins,
+        sums_out,
+        spill_ids_out,
+        spills_out,
+    )
+
+
+WARP_SUMS = """
+#if defined(__CUDACC__)
+    auto warp_max = [](int v) {
+        for (int step = 16; step > 0; step >>= 1) v = max(v, __shfl_xor_sync(0xffffffffu, v, step));
+        return v;
+    };
+    auto warp_any = [](bool v) { return __any_sync(0xffffffffu, v) != 0; };
+    auto warp_add = [](float* p, float v) {
+        for (int step = 16; step > 0; step >>= 1) v += __shfl_xor_sync(0xffffffffu, v, step);
+        if ((threadIdx.x & 31) == 0) atomicAdd(p, v);
+    };
+#else
+    auto warp_max = [](int v) { return v; };
+    auto warp_any = [](bool v) { return v; };
+    auto warp_add = [](float* p, float v) { *p += v; };
+#endif
+"""
+"""Snippet: sums over the 32 pixels of a CUDA warp, which all must come to; over the one pixel on a CPU."""
+
+_PIXEL = f"""
+{LOCATE_PIXEL}{WARP_SUMS}
+    float gradient[4] = {{0.0f, 0.0f, 0.0f, 0.0f}}, R = 0.0f, T = 1.0f;
+    if (inside) {{
+{_PIXEL_GRADIENT}
+        R = behind;
+    }}
+    const int last = inside ? stops.data[pixel] : begin;
+    const int end = warp_max(last);
+    for (int at = begin; at < end; ++at) {{
+        const size_t g = (size_t)ids.data[at];
+        const float* const r = records.data + g * {RECORD};
+        const float* const c = channels.data + g * channels.shape[1] + channel_offset;
+        const float a = r[{FACTOR}], b = r[{FACTOR + 1}], d = r[{FACTOR + 2}];
+        const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
+        const float u = a * dx + b * dy, v = d * dy;
+        const float p = r[{LOG2_OPACITY}] - u * u - v * v;
+        const bool blend = at < last && p >= {float(LOG2_CUTOFF)!r}f;
+        if (!warp_any(blend)) continue;
+        float w = 0.0f, g_p = 0.0f;
+        if (blend) {{
+            const float raw = expf({float(LN2)!r}f * p);
+            const float alpha = raw < {float(ALPHA_MAX)!r}f ? raw : {float(ALPHA_MAX)!r}f;
+            w = alpha * T;
+            float q = 0.0f;
+            for (int i = 0; i < count; ++i) q += c[i] * gradient[i];
+            R -= w * q;
+            if (raw <= {float(ALPHA_MAX)!r}f) g_p = (T * q - R / (1.0f - alpha)) * raw * {2 * LN2!r}f;
+            T -= w;
+        }}
+        const float g_u = g_p * u, g_v = g_p * v;
+        const float g_x = a * g_u, g_y = b * g_u + d * g_v;
+        float* const out = sums_out.data + g * {RECORD};
+        warp_add(out + {MEAN}, g_x);
+        warp_add(out + {MEAN + 1}, g_y);
+        warp_add(out + {FACTOR}, -g_u * dx);
+        warp_add(out + {FACTOR + 1}, -g_u * dy);
+        warp_add(out + {FACTOR + 2}, -g_v * dy);
+        warp_add(out + {LOG2_OPACITY}, 0.5f * g_p);
+        for (int i = 0; i < count; ++i) warp_add(out + {CHANNELS} + i, w * gradient[i]);
+        if (absolute) {{
+            warp_add(out + {BOX}, fabsf(g_x));
+            warp_add(out + {BOX + 1}, fabsf(g_y));
+        }}
+    }}
+"""
+
+
+@wp.func_native(_PIXEL)
+def pixel_backward(
+    index: int,
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    count: int,
+    divided: int,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    sums_out: wp.array2d[float],
+): ...
+
+
+@wp.kernel
+def composite_pixel_backward(
+    start: int,
+    # In:
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    count: int,
+    divided: int,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    # Out:
+    sums_out: wp.array2d[float],
+):
+    """The same for one pixel; launch with blocks of whole warps, or on a CPU from one thread alone."""
+    pixel_backward(
+        start + wp.tid(),
+        records,
+        channels,
+        channel_offset,
+        offsets,
+        ids,
+        stops,
+        width,
+        height,
+        count,
+        divided,
+        absolute,
+        image,
+        transmittance,
+        g_image,
+        g_alphas,
+        sums_out,
+    )
