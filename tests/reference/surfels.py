@@ -27,6 +27,8 @@ from tests.reference.splatting import (
     visible,
 )
 
+STEEP = 2e-3
+
 
 @dataclass(frozen=True)
 class Rendering:
@@ -38,7 +40,8 @@ class Rendering:
     2 w_i w_j (z_i - z_j)), weights [C, N, H, W] and means2d [C, N, 2] in pixels.
 
     margin and kink [C, H, W]: see `tests.reference.splatting.Rendering`. Here the margin counts a
-    transmittance near 0.5 and two kernels (disc and low-pass) nearly equal, too.
+    transmittance near 0.5 and two kernels (disc and low-pass) nearly equal, too, and the kink STEEP over the
+    standard deviations that a disc's hit moves by from a pixel to the next: discs near edge-on lose digits.
     """
 
     image: Tensor
@@ -53,10 +56,10 @@ class Rendering:
     means2d: Tensor
 
 
-def rays(K: Tensor, width: int, height: int) -> Tensor:
-    """[H, W, 3] camera-space directions through the pixel centres, with z = 1."""
+def rays(K: Tensor, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Tensor:
+    """[H, W, 3] camera-space directions through the pixel centres, shifted in pixels, with z = 1."""
     focal, center = intrinsics(K)
-    offsets = pixel_grid(width, height) - center
+    offsets = pixel_grid(width, height) + torch.tensor(shift, dtype=torch.float64) - center
     y = offsets[..., 1] / focal[1, 1]
     x = (offsets[..., 0] - focal[0, 1] * y) / focal[0, 0]
     return torch.stack([x, y, torch.ones_like(x)], -1)
@@ -77,6 +80,17 @@ def intersect(
     v = torch.einsum("nhwi,ni->nhw", hits, torch.linalg.cross(normals, u_axes) / square)
     infinite = torch.full_like(t, float("inf"))
     return tuple(torch.where(parallel, infinite, value) for value in (u, v, t))
+
+
+@torch.no_grad()
+def steepness(points: Tensor, u_axes: Tensor, v_axes: Tensor, K: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """[N, H, W]: how fast the hits u and v [N, H, W] change from pixel to pixel, in standard deviations."""
+    total = torch.zeros_like(u)
+    for shift in ((1e-4, 0.0), (0.0, 1e-4)):
+        directions = rays(K, u.shape[2], u.shape[1], shift)
+        near_u, near_v, _ = intersect(points, u_axes, v_axes, directions)
+        total += ((near_u - u) / 1e-4) ** 2 + ((near_v - v) / 1e-4) ** 2
+    return total.nan_to_num(float("inf")).sqrt()
 
 
 def centers2d(points: Tensor, u_axes: Tensor, v_axes: Tensor, K: Tensor) -> Tensor:
@@ -148,6 +162,7 @@ def render(
             margin, smallest([(disc / low_pass - 1).detach().abs(), (before / 0.5 - 1).abs()], seen)
         )
         kink = torch.minimum(torch.minimum(kink, margin), smallest([color_kinks, cosines], seen))
+        kink = torch.minimum(kink, smallest([STEEP / steepness(points, u_axes, v_axes, K, u, v)], seen & hit))
 
         blended = weights.detach() > 0
         last = torch.where(blended & (before > 0.5), torch.arange(1, len(index) + 1)[:, None, None], 0)
@@ -196,4 +211,4 @@ def depth_normals(depth: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
     return torch.stack(images)
 
 
-__all__ = ["Rendering", "centers2d", "depth_normals", "intersect", "rays", "render"]
+__all__ = ["STEEP", "Rendering", "centers2d", "depth_normals", "intersect", "rays", "render"]

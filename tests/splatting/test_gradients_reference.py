@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.reference import splatting, surfels
+from tests.reference.compare import KINK
 from tests.splatting.scenes import cameras, cloud, features, harmonics
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
@@ -17,8 +18,8 @@ USED = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 def weights_like(outputs: list[Tensor], kink: Tensor, seed: int = 0) -> list[Tensor]:
     """Random weights for outputs [C, H, W, ...], zero at pixels near a kink."""
     g = torch.Generator().manual_seed(seed)
-    smooth = (kink > 1e-3).double()
-    assert smooth.mean() > 0.8
+    smooth = (kink > KINK).double()
+    assert smooth.mean() > 0.7
     return [
         torch.randn(o.shape, generator=g, dtype=torch.float64)
         * smooth.reshape(smooth.shape + (1,) * (o.ndim - 3))
