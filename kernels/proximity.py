@@ -1,4 +1,4 @@
-"""Closest points on a triangle mesh, and inside tests by the generalised winding number."""
+"""Closest points on a triangle mesh, rays, and inside tests by the generalised winding number."""
 
 import warp as wp
 
@@ -67,6 +67,27 @@ def closest_point_facing(
                     v = hit.v
         face_out[i] = face
         barycentric_out[i] = wp.vec3(u, v, 1.0 - u - v)
+
+
+@wp.kernel
+def first_hit(
+    start: int,
+    # In:
+    mesh: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    # Out:
+    face_out: wp.array[int],
+    barycentric_out: wp.array[wp.vec3],
+):
+    """First face each ray meets, from either side, and barycentric coordinates of where; face -1 for none."""
+    i = start + wp.tid()
+    hit = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e10)
+    face_out[i] = -1
+    barycentric_out[i] = wp.vec3(1.0, 0.0, 0.0)
+    if hit.result:
+        face_out[i] = hit.face
+        barycentric_out[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
 
 
 @wp.kernel

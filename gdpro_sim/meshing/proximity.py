@@ -1,4 +1,4 @@
-"""Closest points on a surface and inside tests, over a Warp bounding-volume hierarchy on the CPU."""
+"""Closest points on a surface, rays and inside tests, over a Warp bounding-volume hierarchy on the CPU."""
 
 from __future__ import annotations
 
@@ -71,6 +71,25 @@ class SurfaceIndex:
             )
         weights = np.clip(barycentric.numpy(), 0.0, 1.0)
         return face.numpy(), weights / weights.sum(1, keepdims=True)
+
+    def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """First face each ray meets, from either side: faces [N] int32, -1 for none, and barycentrics [N, 3].
+
+        origins [N, 3] m; directions [N, 3] of any length.
+        """
+        import warp as wp
+
+        from gdpro_sim.device import launch_chunked
+        from gdpro_sim.kernels import proximity as kernels
+
+        count = len(origins)
+        face = wp.empty(count, dtype=wp.int32, device="cpu")
+        barycentric = wp.empty(count, dtype=wp.vec3, device="cpu")
+        where: Any = wp.array(self._unit(origins), dtype=wp.vec3, device="cpu")
+        towards: Any = wp.array(np.ascontiguousarray(directions, np.float32), dtype=wp.vec3, device="cpu")
+        inputs = [self._mesh.id, where, towards]
+        launch_chunked(kernels.first_hit, count, inputs, [face, barycentric], device="cpu")
+        return face.numpy(), barycentric.numpy()
 
     def openness(
         self, points: np.ndarray, normals: np.ndarray, *, reach: float, rays: int = 64
