@@ -1,0 +1,543 @@
+"""Gradients of `gdpro_sim.kernels.surfel_compositing`, front to back again over the same lists.
+
+With weight w_i = alpha_i T_i, and with q_i the gradient at w_i of all images,
+
+    q_i = c_i . g + z_i g_depth + NORMAL_i . g_normal + 2 g_distortion (z_i B_i + D - D_i - D_(i-1))
+    B_i = A_(i-1) - (A - A_i)           A_i, D_i: sums of w and w z up to i; A, D: of all
+
+the gradient at alpha_i is T_i q_i - R_i / (1 - alpha_i) with R_i as in
+`gdpro_sim.kernels.compositing_backward`: it starts as the sum of all w_j q_j, where those of the distortion
+add up to twice it, and loses w_i q_i at every surfel. The gradient at z_i is
+w_i (g_depth + 2 g_distortion B_i), and that of the median where i is the median. Sums over a tile's pixels
+go to the surfel's gradient, see `gdpro_sim.kernels.surfels_backward`; in place of EXTENT and BOX the sums
+over pixels of the absolute gradient at the mean.
+"""
+
+import warp as wp
+
+from gdpro_sim.kernels.compositing import ADVANCE, EXP2, LN2, LOCATE_PIXEL, LOCATE_TILE
+from gdpro_sim.kernels.compositing_backward import SPILL, WARP_SUMS
+from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
+from gdpro_sim.kernels.projection import vec4s
+from gdpro_sim.kernels.slabs import IN_SLAB
+from gdpro_sim.kernels.surfel_compositing import (
+    BLOCK_ARRAYS,
+    ENTRY,
+    EXP,
+    HIT,
+    HIT_DISC,
+    IN_BLOCK,
+    RECORD_FIELDS,
+    SCALAR,
+    VECTOR,
+    WEIGH,
+    WEIGH_DISC,
+)
+from gdpro_sim.kernels.surfels import (
+    BOX,
+    CENTER,
+    CHANNELS,
+    DEPTH,
+    EXTENT,
+    LOG2_OPACITY,
+    MEAN,
+    NORMAL,
+    RECORD,
+    SLOPE,
+    U,
+    V,
+)
+
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        "max_unroll": 0,
+        "default_grid_stride": False,
+        "cpu_compiler_flags": CPU_FLAGS,
+    }
+)
+
+ABSOLUTE = (EXTENT, BOX)
+"""Where the sums of absolute gradients at the mean's x and y go."""
+
+_STATE = """
+    F R[SIZE], D[SIZE], g0[SIZE], g1[SIZE], g2[SIZE], g_depth[SIZE], h0[SIZE], h1[SIZE], h2[SIZE];
+    F g_bend[SIZE], D_all[SIZE], T_end[SIZE], g_median[SIZE];
+    I median_at[SIZE];
+    const bool with_distortion = g_distortion.data != 0, with_median = g_medians.data != 0;
+    for (int i = 0; i < SIZE; ++i) {
+        R[i] = D[i] = g0[i] = g1[i] = g2[i] = g_depth[i] = h0[i] = h1[i] = h2[i] = zero;
+        g_bend[i] = D_all[i] = T_end[i] = g_median[i] = zero;
+        median_at[i] = (I)-1;
+    }
+"""
+
+_PIXEL_GRADIENT = """
+            // An expected depth D / alpha counts as D with a gradient at alpha of its own.
+            float behind = 0.0f, on_alpha = g_alphas.data ? g_alphas.data[pixel] : 0.0f;
+            float gradient[4] = {0.0f, 0.0f, 0.0f, 0.0f}, normal[3] = {0.0f, 0.0f, 0.0f};
+            const float t_end = transmittance.data[pixel];
+            for (int i = 0; i < channels_out; ++i) {
+                float g = g_image.data[pixel * channels_out + i];
+                const float value = image.data[pixel * channels_out + i];
+                behind += value * g;
+                if (i == colours && divided) {
+                    const float alpha = 1.0f - t_end;
+                    if (alpha > 1e-10f) on_alpha -= g * value / alpha;
+                    g /= alpha > 1e-10f ? alpha : 1e-10f;
+                }
+                gradient[i < colours ? i : 3] = g;
+            }
+            if (g_normals.data) {
+                for (int i = 0; i < 3; ++i) {
+                    normal[i] = g_normals.data[3 * pixel + i];
+                    behind += normal[i] * normals.data[3 * pixel + i];
+                }
+            }
+            if (with_distortion) behind += 2.0f * g_distortion.data[pixel] * distortion.data[pixel];
+            behind -= t_end * on_alpha;
+"""
+"""Snippet: `pixel` -> gradients at its sums and `behind`, the first R."""
+
+_GRADIENT = f"""
+            F q = fma((F)r0, g0[k], fma((F)r1, g1[k], r2 * g2[k]));
+            F g_z = zero;
+            if (geometry) {{
+                q = fma((F)nx, h0[k], fma((F)ny, h1[k], fma((F)nz, h2[k], q)));
+                g_z = g_depth[k];
+                q = fma(z, g_z, q);
+                if (with_distortion) {{
+                    const F before = D[k], now = fma(w, z, before);
+                    const F B = (one - t) - ((t - w) - T_end[k]);
+                    g_z = fma(g_bend[k], B, g_z);
+                    q = fma(g_bend[k], fma(z, B, (D_all[k] - before) - now), q);
+                    D[k] = now;
+                }}
+                g_z = w * g_z;
+                if (with_median) g_z += median_at[k] == (I)at ? g_median[k] : zero;
+            }}
+            const F behind = fma(-w, q, R[k]);
+            R[k] = behind;
+            const F g_alpha = fma(t, q, -behind * reciprocal(one - alpha));
+            const F g_p = (blend & (raw <= alpha_max)) ? g_alpha * ({2 * LN2!r}f * raw) : zero;
+"""
+"""Snippet: weight and depth of block k -> gradient g_z at z and g_p, 2 ln 2 times that at p."""
+
+_CHAIN = """
+            const F g_u = g_p * inverse * u, g_v = g_p * inverse * v;
+            const F g_depth_ = g_z * inverse;
+            const F g_w = fma(g_u, u, fma(g_v, v, -g_depth_ * z));
+"""
+"""Snippet: -> minus the gradients at U . e and V . e, that at W and that at DEPTH, where the disc is hit."""
+
+_CHAIN_BLUR = """
+            const F on_disc_p = hit ? g_p : zero, g_low = log2_e * (hit ? zero : g_p);
+            const F g_u = on_disc_p * inverse * u, g_v = on_disc_p * inverse * v;
+            const F g_depth_ = g_z * scale;
+            const F g_w = fma(g_u, u, fma(g_v, v, hit ? -g_depth_ * z : zero));
+"""
+
+_ADD = """
+            sum_p += g_p;
+            sum_z += g_depth_;
+            sum_u += g_u;
+            sum_v += g_v;
+            sum_w += g_w;
+            const F bx = (F)exb[k], by = (F)eyb[k];
+            sum_ux = fma(bx, g_u, sum_ux);
+            sum_uy = fma(by, g_u, sum_uy);
+            sum_vx = fma(bx, g_v, sum_vx);
+            sum_vy = fma(by, g_v, sum_vy);
+            sum_wx = fma(bx, g_w, sum_wx);
+            sum_wy = fma(by, g_w, sum_wy);
+            sum_0 = fma(w, g0[k], sum_0);
+            sum_1 = fma(w, g1[k], sum_1);
+            sum_2 = fma(w, g2[k], sum_2);
+            if (geometry) {
+                sum_n0 = fma(w, h0[k], sum_n0);
+                sum_n1 = fma(w, h1[k], sum_n1);
+                sum_n2 = fma(w, h2[k], sum_n2);
+            }
+"""
+
+_ABSOLUTE = """
+            if (absolute) {
+                abs_x += abs_(fma((F)u_x, g_u, fma((F)v_x, g_v, -w_x * g_w)) LOW_X);
+                abs_y += abs_(fma((F)u_y, g_u, fma((F)v_y, g_v, -w_y * g_w)) LOW_Y);
+            }
+"""
+
+_ADD_DISC = _ADD + _ABSOLUTE.replace(" LOW_X", "").replace(" LOW_Y", "")
+_ADD_BLUR = (
+    _ADD
+    + """
+            sum_lx = fma(dx, g_low, sum_lx);
+            sum_ly = fma(dy, g_low, sum_ly);
+"""
+    + _ABSOLUTE.replace("LOW_X", "+ dx * g_low").replace("LOW_Y", "+ dy * g_low")
+)
+
+_TILE = f"""
+#if !defined(__CUDACC__)
+{LOCATE_TILE}{VECTOR}{SUM_LANES}{IN_SLAB}{BLOCK_ARRAYS}
+    float exb[16] __attribute__((aligned(64))), eyb[16] __attribute__((aligned(64)));
+    const int channels_out = image.shape[1];
+{_STATE}
+    for (int y = 0; y < y_end; ++y) {{
+        for (int x = 0; x < x_end; ++x) {{
+            const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
+            const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
+{_PIXEL_GRADIENT}
+            R[k][lane] = behind;
+            g0[k][lane] = gradient[0];
+            g1[k][lane] = gradient[1];
+            g2[k][lane] = gradient[2];
+            g_depth[k][lane] = gradient[3];
+            h0[k][lane] = normal[0];
+            h1[k][lane] = normal[1];
+            h2[k][lane] = normal[2];
+            if (with_distortion) {{
+                g_bend[k][lane] = 2.0f * g_distortion.data[pixel];
+                D_all[k][lane] = depths.data[pixel];
+                T_end[k][lane] = t_end;
+            }}
+            if (with_median) {{
+                g_median[k][lane] = g_medians.data[pixel];
+                median_at[k][lane] = medians_at.data[pixel];
+            }}
+        }}
+    }}
+
+    const bool whole = slab_begin == 0 && slab_end == offsets.shape[0] - 1;
+    int spill = whole ? 0 : spill_begins.data[tile];
+    const float* const record = records.data;
+    const float* const colour = channels.data + channel_offset;
+    const int channel_stride = channels.shape[1];
+    const int* const id = ids.data;
+    const int end = stops.data[tile];
+    const int WIDTH = {RECORD};
+    for (int at = begin; at < end; ++at) {{
+{ENTRY}
+        *(F*)exb = ex;
+        *(F*)eyb = ey;
+        F sum_p = zero, sum_z = zero, sum_u = zero, sum_v = zero, sum_w = zero, sum_lx = zero, sum_ly = zero;
+        F sum_ux = zero, sum_uy = zero, sum_vx = zero, sum_vy = zero, sum_wx = zero, sum_wy = zero;
+        F sum_0 = zero, sum_1 = zero, sum_2 = zero, sum_n0 = zero, sum_n1 = zero, sum_n2 = zero;
+        F abs_x = zero, abs_y = zero;
+        while (mask) {{
+            const int k = __builtin_ctz(mask);
+            mask &= mask - 1;
+            const F un = u_lane + ub[k], vn = v_lane + vb[k], wn = w_lane + wb[k];
+{HIT_DISC}{EXP2}{WEIGH_DISC}{_GRADIENT}{_CHAIN}{_ADD_DISC}{ADVANCE}
+        }}
+        while (blurred) {{
+            const int k = __builtin_ctz(blurred);
+            blurred &= blurred - 1;
+{IN_BLOCK}{HIT}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}{ADVANCE}
+        }}
+{SPILL}
+        // e is block offset plus lane offset.
+        const F center_x = fma((F)u_x, sum_u, fma((F)v_x, sum_v, -w_x * sum_w));
+        const F center_y = fma((F)u_y, sum_u, fma((F)v_y, sum_v, -w_y * sum_w));
+        const F sums[16] = {{
+            center_x + sum_lx, center_y + sum_ly, center_x, center_y,
+            -fma(column, sum_u, sum_ux), -fma(row, sum_u, sum_uy),
+            -fma(column, sum_v, sum_vx), -fma(row, sum_v, sum_vy),
+            fma(column, sum_w, sum_wx), fma(row, sum_w, sum_wy),
+            one_half * sum_p, abs_x, sum_0, sum_1, sum_2, sum_z,
+        }};
+        F total;
+        __builtin_memcpy(&total, out, 64);
+        total += sum_lanes(sums);
+        __builtin_memcpy(out, &total, 64);
+        if (geometry || absolute) {{
+            const F c0 = MERGE_2(sum_n0, sum_n2), c1 = MERGE_2(sum_n1, abs_y), c = MERGE_1(c0, c1);
+            const F c4 = MERGE_4(c, c), c8 = MERGE_8(c4, c4);
+            for (int i = 0; i < 4; ++i) out[16 + i] += c8[i];
+        }}
+    }}
+#endif
+"""
+
+assert (MEAN, CENTER, U, V, SLOPE, LOG2_OPACITY, ABSOLUTE[0], CHANNELS, DEPTH, NORMAL, ABSOLUTE[1]) == (
+    *range(0, 12, 2),
+    11,
+    12,
+    15,
+    16,
+    19,
+), "the tile kernel writes its sums in this order"
+
+
+@wp.func_native(_TILE)
+def tile_backward(
+    tile: int,
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    colours: int,
+    divided: bool,
+    geometry: bool,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    depths: wp.array[float],
+    normals: wp.array2d[float],
+    distortion: wp.array[float],
+    medians_at: wp.array[int],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    g_normals: wp.array2d[float],
+    g_distortion: wp.array[float],
+    g_medians: wp.array[float],
+    rects: wp.array[vec4s],
+    slab_begin: int,
+    slab_end: int,
+    spill_begins: wp.array[int],
+    sums_out: wp.array2d[float],
+    spill_ids_out: wp.array[int],
+    spills_out: wp.array2d[float],
+): ...
+
+
+@wp.kernel
+def surfel_tile_backward(
+    start: int,
+    # In:
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    colours: int,
+    divided: bool,
+    geometry: bool,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    depths: wp.array[float],
+    normals: wp.array2d[float],
+    distortion: wp.array[float],
+    medians_at: wp.array[int],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    g_normals: wp.array2d[float],
+    g_distortion: wp.array[float],
+    g_medians: wp.array[float],
+    rects: wp.array[vec4s],
+    slab_begin: int,
+    slab_end: int,
+    spill_begins: wp.array[int],
+    # Out:
+    sums_out: wp.array2d[float],
+    spill_ids_out: wp.array[int],
+    spills_out: wp.array2d[float],
+):
+    """Add one tile's gradients of records to `sums_out` or its spills; `image` and on from the forward pass.
+
+    Gradients of images other than `g_image` may be empty: zero. Sums of absolute gradients where `absolute`.
+    """
+    tile_backward(
+        start + wp.tid(),
+        records,
+        channels,
+        channel_offset,
+        offsets,
+        ids,
+        stops,
+        width,
+        height,
+        colours,
+        divided,
+        geometry,
+        absolute,
+        image,
+        transmittance,
+        depths,
+        normals,
+        distortion,
+        medians_at,
+        g_image,
+        g_alphas,
+        g_normals,
+        g_distortion,
+        g_medians,
+        rects,
+        slab_begin,
+        slab_end,
+        spill_begins,
+        sums_out,
+        spill_ids_out,
+        spills_out,
+    )
+
+
+_PIXEL = f"""
+{LOCATE_PIXEL}{WARP_SUMS}{SCALAR}
+    const int channels_out = image.shape[1];
+{_STATE}
+    if (inside) {{
+{_PIXEL_GRADIENT}
+        R[0] = behind;
+        g0[0] = gradient[0], g1[0] = gradient[1], g2[0] = gradient[2], g_depth[0] = gradient[3];
+        h0[0] = normal[0], h1[0] = normal[1], h2[0] = normal[2];
+        if (with_distortion) {{
+            g_bend[0] = 2.0f * g_distortion.data[pixel];
+            D_all[0] = depths.data[pixel];
+            T_end[0] = t_end;
+        }}
+        if (with_median) {{
+            g_median[0] = g_medians.data[pixel];
+            median_at[0] = medians_at.data[pixel];
+        }}
+    }}
+    const int last = inside ? stops.data[pixel] : begin;
+    const int end = warp_max(last);
+    for (int at = begin; at < end; ++at) {{
+        const size_t g = (size_t)ids.data[at];
+        const float* const r = records.data + g * {RECORD};
+        const float* const c = channels.data + g * channels.shape[1] + channel_offset;
+{RECORD_FIELDS}
+        const float ex = (float)x + 0.5f - r[{CENTER}], ey = (float)y + 0.5f - r[{CENTER + 1}];
+        const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
+        const float un = u_x * ex + u_y * ey, vn = v_x * ex + v_y * ey, wn = 1.0f + w_x * ex + w_y * ey;
+{HIT}
+        const bool blends = at < last && p >= cutoff;
+        if (!warp_any(blends)) continue;
+        float sum_p = 0.0f, sum_z = 0.0f, sum_u = 0.0f, sum_v = 0.0f, sum_w = 0.0f, sum_lx = 0.0f,
+            sum_ly = 0.0f;
+        float sum_ux = 0.0f, sum_uy = 0.0f, sum_vx = 0.0f, sum_vy = 0.0f, sum_wx = 0.0f, sum_wy = 0.0f;
+        float sum_0 = 0.0f, sum_1 = 0.0f, sum_2 = 0.0f, sum_n0 = 0.0f, sum_n1 = 0.0f, sum_n2 = 0.0f;
+        float abs_x = 0.0f, abs_y = 0.0f;
+        if (blends) {{
+            const float exb[1] = {{ex}}, eyb[1] = {{ey}};
+{EXP}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}
+            T[0] = next;
+        }}
+        const float center_x = u_x * sum_u + v_x * sum_v - w_x * sum_w;
+        const float center_y = u_y * sum_u + v_y * sum_v - w_y * sum_w;
+        float* const out = sums_out.data + g * {RECORD};
+        warp_add(out + {MEAN}, center_x + sum_lx);
+        warp_add(out + {MEAN + 1}, center_y + sum_ly);
+        warp_add(out + {CENTER}, center_x);
+        warp_add(out + {CENTER + 1}, center_y);
+        warp_add(out + {U}, -sum_ux);
+        warp_add(out + {U + 1}, -sum_uy);
+        warp_add(out + {V}, -sum_vx);
+        warp_add(out + {V + 1}, -sum_vy);
+        warp_add(out + {SLOPE}, sum_wx);
+        warp_add(out + {SLOPE + 1}, sum_wy);
+        warp_add(out + {LOG2_OPACITY}, 0.5f * sum_p);
+        warp_add(out + {CHANNELS}, sum_0);
+        warp_add(out + {CHANNELS + 1}, sum_1);
+        warp_add(out + {CHANNELS + 2}, sum_2);
+        if (geometry) {{
+            warp_add(out + {DEPTH}, sum_z);
+            warp_add(out + {NORMAL}, sum_n0);
+            warp_add(out + {NORMAL + 1}, sum_n1);
+            warp_add(out + {NORMAL + 2}, sum_n2);
+        }}
+        if (absolute) {{
+            warp_add(out + {ABSOLUTE[0]}, abs_x);
+            warp_add(out + {ABSOLUTE[1]}, abs_y);
+        }}
+    }}
+"""
+
+
+@wp.func_native(_PIXEL)
+def pixel_backward(
+    index: int,
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    colours: int,
+    divided: bool,
+    geometry: bool,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    depths: wp.array[float],
+    normals: wp.array2d[float],
+    distortion: wp.array[float],
+    medians_at: wp.array[int],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    g_normals: wp.array2d[float],
+    g_distortion: wp.array[float],
+    g_medians: wp.array[float],
+    sums_out: wp.array2d[float],
+): ...
+
+
+@wp.kernel
+def surfel_pixel_backward(
+    start: int,
+    # In:
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    stops: wp.array[int],
+    width: int,
+    height: int,
+    colours: int,
+    divided: bool,
+    geometry: bool,
+    absolute: bool,
+    image: wp.array2d[float],
+    transmittance: wp.array[float],
+    depths: wp.array[float],
+    normals: wp.array2d[float],
+    distortion: wp.array[float],
+    medians_at: wp.array[int],
+    g_image: wp.array2d[float],
+    g_alphas: wp.array[float],
+    g_normals: wp.array2d[float],
+    g_distortion: wp.array[float],
+    g_medians: wp.array[float],
+    # Out:
+    sums_out: wp.array2d[float],
+):
+    """The same for one pixel; launch with blocks of whole warps, or on a CPU from one thread alone."""
+    pixel_backward(
+        start + wp.tid(),
+        records,
+        channels,
+        channel_offset,
+        offsets,
+        ids,
+        stops,
+        width,
+        height,
+        colours,
+        divided,
+        geometry,
+        absolute,
+        image,
+        transmittance,
+        depths,
+        normals,
+        distortion,
+        medians_at,
+        g_image,
+        g_alphas,
+        g_normals,
+        g_distortion,
+        g_medians,
+        sums_out,
+    )

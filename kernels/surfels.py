@@ -1,0 +1,318 @@
+"""Projection of surfels, flat Gaussians on discs, forward.
+
+A surfel lies in the plane of its rotation's first two columns and is seen where a pixel's ray meets it (Huang
+et al., "2D Gaussian Splatting for Geometrically Accurate Radiance Fields", 2024). With e the pixel's offset
+from the projected centre, the hit has
+
+    u = (U . e) / W,   v = (V . e) / W,   z = DEPTH / W,   W = 1 + SLOPE . e
+
+exactly: perspective is a ratio of linear functions of the pixel, and the centre is seen at e = 0. u and v
+are in standard deviations times sqrt(log2(e) / 2), so that the disc's kernel is exp2(-(u^2 + v^2)). A
+low-pass exp2(-log2(e) d^2), d the pixel's offset from the mean, stands in where it is larger: for discs
+thinner than a pixel. Every surfel seen by a camera becomes one record of 24 float32:
+
+    MEAN          2  centre in pixels of the ellipse that the one-sigma circle projects to; where that circle
+                     reaches behind the camera, CENTER
+    CENTER        2  projected centre in pixels
+    U, V, SLOPE   6  1/pixel
+    LOG2_OPACITY  1  base-2 logarithm of the opacity
+    EXTENT        1  sqrt(u^2 + v^2) where alpha = 1/255
+    CHANNELS      3  the first three channels to blend
+    DEPTH         1  camera-space z of the centre in metres
+    NORMAL        3  world-space unit normal, facing the camera
+    BOX           4  centre and half extents in pixels of the box outside which alpha < 1/255
+    REACH         1  the longest (U . e, V . e) from a 4 x 4 block's centre to its corners
+
+Culled surfels have a record of zeros, an empty rectangle and an infinite sort key. The index of the kernel
+is a group of `LANES` surfels of one camera (see `gdpro_sim.kernels.lanes`), camera after camera.
+"""
+
+import warp as wp
+
+from gdpro_sim.kernels.harmonics import HARMONICS
+from gdpro_sim.kernels.lanes import CPU_FLAGS, PRELUDE
+from gdpro_sim.kernels.projection import (
+    CAMERA,
+    LOG2_CUTOFF,
+    PINHOLE,
+    ROTATION,
+    SLACK,
+    SQRT_HALF_LOG2_E,
+    TILE,
+    vec4s,
+)
+
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        "max_unroll": 0,
+        "default_grid_stride": False,
+        "cpu_compiler_flags": CPU_FLAGS,
+    }
+)
+
+RECORD = 24
+MEAN = 0
+CENTER = 2
+U = 4
+V = 6
+SLOPE = 8
+LOG2_OPACITY = 10
+EXTENT = 11
+CHANNELS = 12
+DEPTH = 15
+NORMAL = 16
+BOX = 19
+REACH = 23
+
+LOG2_E = 1.4426950408889634
+
+GRAZING = 1.0e-7
+"""Sine, nearly, of the smallest angle between disc and ray to the centre; flatter discs count as so much."""
+
+STEEPEST = 1.0e12
+"""Largest U, V in 1/pixel: keeps squares of u and v meaningful for discs of no size."""
+
+SURFEL = f"""
+    // Tangents a, b in camera space; z times their images' directions at the centre, pixels.
+    const int scale_stride = scales.shape[1];
+    const float* const scale = scales.data + (size_t)n * scale_stride;
+    const F s0 = load(scale, scale_stride), s1 = load(scale + 1, scale_stride);
+    const F ax = r00 * q00 + r01 * q10 + r02 * q20, ay = r10 * q00 + r11 * q10 + r12 * q20,
+        az = r20 * q00 + r21 * q10 + r22 * q20;
+    const F bx = r00 * q01 + r01 * q11 + r02 * q21, by = r10 * q01 + r11 * q11 + r12 * q21,
+        bz = r20 * q01 + r21 * q11 + r22 * q21;
+    const F iax = fx * ax + skew * ay - offset_x * az, iay = fy * ay - offset_y * az;
+    const F ibx = fx * bx + skew * by - offset_x * bz, iby = fy * by - offset_y * bz;
+    // What a unit square of the disc covers, times z^2; zero for a disc seen from its edge.
+    const F covered = iax * iby - iay * ibx;
+    const F least = {GRAZING!r}f * (iax * iax + iay * iay + ibx * ibx + iby * iby);
+    const I grazing = abs_(covered) < least;
+    const F area = select(grazing, select(covered < 0.0f, -least, least), covered);
+    const F inverse_area = 1.0f / area;
+    const F steepest = splat({STEEPEST!r}f);
+    const F along = {SQRT_HALF_LOG2_E!r}f * z * inverse_area;
+    const F pu = max_(min_(along / s0, steepest), -steepest),
+        pv = max_(min_(along / s1, steepest), -steepest);
+    const F u_x = pu * iby, u_y = -pu * ibx, v_x = -pv * iay, v_y = pv * iax;
+    const F w_x = (bz * iay - az * iby) * inverse_area, w_y = (az * ibx - bz * iax) * inverse_area;
+
+    // Centre of the one-sigma circle's image, from the projected centre.
+    const F sa = s0 * s0 * az, sb = s1 * s1 * bz;
+    const F behind = sa * az + sb * bz;
+    const F ahead = z * z - behind;
+    const I whole = ahead > 1.0e-6f * z * z;
+    const F shift_x = select(whole, -(sa * iax + sb * ibx) / ahead, splat(0.0f));
+    const F shift_y = select(whole, -(sa * iay + sb * iby) / ahead, splat(0.0f));
+
+    // The normal turned towards the camera.
+    const F nx = r00 * q02 + r01 * q12 + r02 * q22, ny = r10 * q02 + r11 * q12 + r12 * q22,
+        nz = r20 * q02 + r21 * q12 + r22 * q22;
+    const F side = select(nx * x + ny * y + nz * z > 0.0f, splat(-1.0f), splat(1.0f));
+"""
+"""Snippet: after CAMERA, PINHOLE and ROTATION -> U, V, SLOPE as u_x .. w_y, shift (from centre to mean),
+side."""
+
+_PROJECT = f"""
+    const int groups = (means.shape[0] + lanes_per_group - 1) / lanes_per_group;
+    const int camera = group / groups;
+    const int n = (group - camera * groups) * lanes_per_group;
+    const int left = means.shape[0] - n;
+    const int lanes = left < lanes_per_group ? left : lanes_per_group;
+    const size_t first = (size_t)camera * means.shape[0] + n;
+{PRELUDE}{CAMERA}{PINHOLE}{ROTATION}{SURFEL}
+    const F zero = splat(0.0f);
+    const F center_x = offset_x + cx, center_y = offset_y + cy;
+    const F opacity = load(opacities.data + n, 1);
+    const F log2_opacity = log2_(max_(opacity, splat(1.2e-38f)));
+    const F extent2 = log2_opacity - {LOG2_CUTOFF!r}f;
+    const F extent = sqrt_(max_(extent2, zero));
+
+    // Box around the image of the disc's part above the cutoff, where it is before the camera: the outermost
+    // x of
+    // the circle of radius r standard deviations solve (x z)^2 = r^2 ((ia - x az)^2 s0^2 + (ib - x bz)^2
+    // s1^2).
+    const F r2 = extent2 * {float(SQRT_HALF_LOG2_E) ** -2!r}f;
+    const F front = z * z - r2 * behind;
+    const I bounded = front > 0.01f * z * z;
+    const F scaled = r2 / front;
+    const F mid_x = -scaled * (sa * iax + sb * ibx), mid_y = -scaled * (sa * iay + sb * iby);
+    const F ea = s0 * s0 * scaled, eb = s1 * s1 * scaled;
+    const F half_x = sqrt_(mid_x * mid_x + ea * iax * iax + eb * ibx * ibx);
+    const F half_y = sqrt_(mid_y * mid_y + ea * iay * iay + eb * iby * iby);
+    const F blur = extent * {LOG2_E**-0.5!r}f;
+    const F low_x = min_(mid_x - half_x, shift_x - blur), high_x = max_(mid_x + half_x, shift_x + blur);
+    const F low_y = min_(mid_y - half_y, shift_y - blur), high_y = max_(mid_y + half_y, shift_y + blur);
+    const F mean_x = select(bounded, center_x + 0.5f * (low_x + high_x), splat(0.5f * (float)width));
+    const F mean_y = select(bounded, center_y + 0.5f * (low_y + high_y), splat(0.5f * (float)height));
+    const float slack = {0.5 * float(SLACK)!r}f;
+    const F box_x = select(bounded, (high_x - low_x) * slack + 1.0e-6f * abs_(center_x), splat((float)width));
+    const F box_y = select(bounded, (high_y - low_y) * slack + 1.0e-6f * abs_(center_y),
+        splat((float)height));
+
+    // Pixels whose centre lies in the box, then the tiles they lie in (end exclusive).
+    const F x0 = max_(ceil_(mean_x - box_x - 0.5f), zero);
+    const F y0 = max_(ceil_(mean_y - box_y - 0.5f), zero);
+    const F x1 = min_(floor_(mean_x + box_x - 0.5f), splat((float)(width - 1)));
+    const F y1 = min_(floor_(mean_y + box_y - 0.5f), splat((float)(height - 1)));
+    // A sum of magnitudes is finite only where all its terms are.
+    const F size = abs_(u_x) + abs_(u_y) + abs_(v_x) + abs_(v_y) + abs_(w_x) + abs_(w_y) + abs_(s0) + abs_(s1)
+        + abs_(opacity) + box_x + box_y + z * 1.0e16f;
+    const F far_out = abs_(center_x) + abs_(center_y) + abs_(shift_x) + abs_(shift_y);
+    I drawn = (z >= near) & (z <= far) & (z > 0.0f) & (extent2 >= 0.0f) & (opacity > 0.0f) & finite(size)
+        & (far_out < {STEEPEST!r}f) & (x0 <= x1) & (y0 <= y1)
+            & ((box_x > radius_clip) | (box_y > radius_clip));
+
+    F fields[{RECORD}];
+    if (any(drawn)) {{
+        if (degree >= 0) {{
+{HARMONICS}
+            drawn = drawn & finite(red) & finite(green) & finite(blue);
+            fields[{CHANNELS}] = max_(red, zero);
+            fields[{CHANNELS + 1}] = max_(green, zero);
+            fields[{CHANNELS + 2}] = max_(blue, zero);
+        }} else {{
+            const int width_ = features.shape[1];
+            const float* const feature = features.data + (first % features.shape[0]) * width_;
+            for (int i = 0; i < 3; ++i) fields[{CHANNELS} + i] = zero;
+            for (int i = 0; i < width_; ++i) {{
+                const F value = load(feature + i, width_);
+                drawn = drawn & finite(value);
+                if (i < 3) fields[{CHANNELS} + i] = value;
+            }}
+        }}
+    }}
+    const F corner_x = u_x + u_y, corner_y = v_x + v_y, other_x = u_x - u_y, other_y = v_x - v_y;
+    const F corner2 = max_(corner_x * corner_x + corner_y * corner_y, other_x * other_x + other_y * other_y);
+    fields[{MEAN}] = center_x + shift_x;
+    fields[{MEAN + 1}] = center_y + shift_y;
+    fields[{CENTER}] = center_x;
+    fields[{CENTER + 1}] = center_y;
+    fields[{U}] = u_x;
+    fields[{U + 1}] = u_y;
+    fields[{V}] = v_x;
+    fields[{V + 1}] = v_y;
+    fields[{SLOPE}] = w_x;
+    fields[{SLOPE + 1}] = w_y;
+    fields[{LOG2_OPACITY}] = log2_opacity;
+    fields[{EXTENT}] = extent * {float(SLACK)!r}f;
+    fields[{DEPTH}] = z;
+    fields[{NORMAL}] = side * q02;
+    fields[{NORMAL + 1}] = side * q12;
+    fields[{NORMAL + 2}] = side * q22;
+    fields[{BOX}] = mean_x;
+    fields[{BOX + 1}] = mean_y;
+    fields[{BOX + 2}] = box_x;
+    fields[{BOX + 3}] = box_y;
+    fields[{REACH}] = {1.5 * float(SLACK)!r}f * sqrt_(corner2);
+    float* const record = records_out.data + first * {RECORD};
+    F later[16];
+    for (int i = 0; i < {RECORD}; ++i) fields[i] = select(drawn, fields[i], zero);
+    for (int i = 0; i < 16; ++i) later[i] = fields[{RECORD - 16} + i];
+    store_rows(record, {RECORD}, fields);
+    store_rows(record + {RECORD - 16}, {RECORD}, later);
+    const F largest = splat(1.0e9f);
+    const I radius_x = to_int(select(drawn, min_(ceil_(box_x), largest), zero));
+    const I radius_y = to_int(select(drawn, min_(ceil_(box_y), largest), zero));
+    const F tile = splat({1 / TILE!r}f);
+    const I begin_x = to_int(select(drawn, x0 * tile, zero)),
+        begin_y = to_int(select(drawn, y0 * tile, zero));
+    const I end_x = to_int(select(drawn, x1 * tile + 1.0f, zero));
+    const I end_y = to_int(select(drawn, y1 * tile + 1.0f, zero));
+    const F key = select(drawn, z, splat(1.0f / 0.0f));
+    store(keys_out.data + (size_t)camera * keys_out.shape[1] + n, 1, key);
+    int* const radius = (int*)(radii_out.data + first);
+    short* const rect = (short*)(rects_out.data + first);
+    int* const order = order_out.data + (size_t)camera * order_out.shape[1] + n;
+    for (int j = 0; j < lanes; ++j) {{
+        radius[2 * j] = lane_int(radius_x, j);
+        radius[2 * j + 1] = lane_int(radius_y, j);
+        rect[4 * j] = (short)lane_int(begin_x, j);
+        rect[4 * j + 1] = (short)lane_int(begin_y, j);
+        rect[4 * j + 2] = (short)lane_int(end_x, j);
+        rect[4 * j + 3] = (short)lane_int(end_y, j);
+        order[j] = (int)first + j;
+    }}
+"""
+
+
+@wp.func_native(_PROJECT)
+def project_group(
+    group: int,
+    lanes_per_group: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array2d[float],
+    opacities: wp.array[float],
+    sh: wp.array2d[wp.vec3],
+    features: wp.array2d[float],
+    degree: int,
+    viewmats: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.mat33],
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    radius_clip: float,
+    records_out: wp.array2d[float],
+    radii_out: wp.array[wp.vec2i],
+    rects_out: wp.array[vec4s],
+    keys_out: wp.array2d[float],
+    order_out: wp.array2d[int],
+): ...
+
+
+@wp.kernel
+def project_surfels(
+    start: int,
+    # In:
+    lanes: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array2d[float],
+    opacities: wp.array[float],
+    sh: wp.array2d[wp.vec3],
+    features: wp.array2d[float],
+    degree: int,
+    viewmats: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.mat33],
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    radius_clip: float,
+    # Out:
+    records_out: wp.array2d[float],
+    radii_out: wp.array[wp.vec2i],
+    rects_out: wp.array[vec4s],
+    keys_out: wp.array2d[float],
+    order_out: wp.array2d[int],
+):
+    """One record for each camera and surfel; culls what is not seen, not finite or fainter than 1/255.
+
+    Channels are max(0, SH(direction from the camera) + 0.5) where degree >= 0, else the first three of
+    features, row i % rows. `lanes` is 16 on a CPU and 1 on a GPU.
+    """
+    project_group(
+        start + wp.tid(),
+        lanes,
+        means,
+        quats,
+        scales,
+        opacities,
+        sh,
+        features,
+        degree,
+        viewmats,
+        intrinsics,
+        width,
+        height,
+        near,
+        far,
+        radius_clip,
+        records_out,
+        radii_out,
+        rects_out,
+        keys_out,
+        order_out,
+    )
