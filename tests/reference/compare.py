@@ -22,6 +22,12 @@ def in_mode(mode: str, image: Tensor, depth: Tensor, alpha: Tensor) -> Tensor:
     return torch.cat([*parts, depth[..., None]] if mode != "RGB" else parts, -1)
 
 
+def covered(mode: str, kink: Tensor, alpha: Tensor) -> Tensor:
+    """`kink`, also zero in modes with expected depth where 0 < alpha < 0.1: 1 - T has few digits there."""
+    few = (alpha > 0) & (alpha < 0.1) & mode.endswith("ED")
+    return torch.where(few, 0.0, kink)
+
+
 def functional(shapes: Outputs, kink: Tensor, seed: int = 0, least: float = 0.8) -> Outputs:
     """Weights for outputs [C, H, W, ...]: normal numbers that float32 holds, zero at pixels near a kink."""
     g = torch.Generator().manual_seed(seed)
@@ -86,4 +92,4 @@ def compare(
     return errors(gradients(apply(weights, got), singles), gradients(apply(weights, expected), doubles))
 
 
-__all__ = ["KINK", "apply", "compare", "errors", "functional", "gradients", "in_mode", "leaves"]
+__all__ = ["KINK", "apply", "compare", "covered", "errors", "functional", "gradients", "in_mode", "leaves"]

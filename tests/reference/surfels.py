@@ -40,8 +40,8 @@ class Rendering:
     2 w_i w_j (z_i - z_j)), weights [C, N, H, W] and means2d [C, N, 2] in pixels.
 
     margin and kink [C, H, W]: see `tests.reference.splatting.Rendering`. Here the margin counts a
-    transmittance near 0.5 and two kernels (disc and low-pass) nearly equal, too, and the kink STEEP over the
-    standard deviations that a disc's hit moves by from a pixel to the next: discs near edge-on lose digits.
+    transmittance near 0.5 and two kernels (disc and low-pass) nearly equal, too, and STEEP over the standard
+    deviations that a disc's hit moves by from a pixel to the next: discs near edge-on lose digits.
     """
 
     image: Tensor
@@ -56,10 +56,10 @@ class Rendering:
     means2d: Tensor
 
 
-def rays(K: Tensor, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> Tensor:
-    """[H, W, 3] camera-space directions through the pixel centres, shifted in pixels, with z = 1."""
+def rays(K: Tensor, pixels: Tensor) -> Tensor:
+    """[..., 3] camera-space directions through pixel positions [..., 2], with z = 1."""
     focal, center = intrinsics(K)
-    offsets = pixel_grid(width, height) + torch.tensor(shift, dtype=torch.float64) - center
+    offsets = pixels - center
     y = offsets[..., 1] / focal[1, 1]
     x = (offsets[..., 0] - focal[0, 1] * y) / focal[0, 0]
     return torch.stack([x, y, torch.ones_like(x)], -1)
@@ -68,9 +68,9 @@ def rays(K: Tensor, width: int, height: int, shift: tuple[float, float] = (0.0, 
 def intersect(
     points: Tensor, u_axes: Tensor, v_axes: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Hits of rays t d [H, W, 3] with planes p + u a + v b: u, v and t [N, H, W]; infinite where parallel."""
+    """Hits u, v and t [N, H, W] of rays t d [N or 1, H, W, 3] with planes p + u a + v b; else infinite."""
     normals = torch.linalg.cross(u_axes, v_axes)
-    facing_ray = torch.einsum("ni,hwi->nhw", normals, directions)
+    facing_ray = (normals[:, None, None] * directions).sum(-1)
     parallel = facing_ray == 0
     t = (normals * points).sum(-1)[:, None, None] / torch.where(parallel, 1.0, facing_ray)
     hits = t[..., None] * directions - points[:, None, None]
@@ -83,27 +83,31 @@ def intersect(
 
 
 @torch.no_grad()
-def steepness(points: Tensor, u_axes: Tensor, v_axes: Tensor, K: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """[N, H, W]: how fast the hits u and v [N, H, W] change from pixel to pixel, in standard deviations."""
+def steepness(points: Tensor, u_axes: Tensor, v_axes: Tensor, K: Tensor, pixels: Tensor) -> Tensor:
+    """[N, H, W]: how far the hits (u, v) of rays through pixels [N or 1, H, W, 2] move in a pixel."""
+    u, v, _ = intersect(points, u_axes, v_axes, rays(K, pixels))
     total = torch.zeros_like(u)
-    for shift in ((1e-4, 0.0), (0.0, 1e-4)):
-        directions = rays(K, u.shape[2], u.shape[1], shift)
-        near_u, near_v, _ = intersect(points, u_axes, v_axes, directions)
+    for shift in torch.eye(2, dtype=torch.float64) * 1e-4:
+        near_u, near_v, _ = intersect(points, u_axes, v_axes, rays(K, pixels + shift))
         total += ((near_u - u) / 1e-4) ** 2 + ((near_v - v) / 1e-4) ** 2
     return total.nan_to_num(float("inf")).sqrt()
 
 
-def centers2d(points: Tensor, u_axes: Tensor, v_axes: Tensor, K: Tensor) -> Tensor:
-    """[N, 2] pixels: centres of the ellipses that the discs' one-sigma circles project to.
+def centers2d(points: Tensor, u_axes: Tensor, v_axes: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """[N, 2] pixels: centres of the ellipses that the discs' one-sigma circles project to, and margins [N].
 
     A circle point is p + cos(s) a + sin(s) b. Its image's outermost x solve
-    (p_x - x p_z)^2 = (a_x - x a_z)^2 + (b_x - x b_z)^2, and the centre lies half way between the two.
+    (p_x - x p_z)^2 = (a_x - x a_z)^2 + (b_x - x b_z)^2, and the centre lies half way between the two. Where
+    the circle crosses the camera's plane there is no ellipse: the projected centre is taken instead.
     """
     columns = torch.stack([points, u_axes, v_axes], -1)
     signed = columns * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    middle = (signed[:, :2] * columns[:, 2:]).sum(-1) / (signed[:, 2:] * columns[:, 2:]).sum(-1)
+    square = (signed[:, 2:] * columns[:, 2:]).sum(-1)
+    ahead = square.detach() > 0
+    middle = (signed[:, :2] * columns[:, 2:]).sum(-1) / torch.where(ahead, square, 1.0)
+    middle = torch.where(ahead, middle, points[:, :2] / points[:, 2:])
     focal, center = intrinsics(K)
-    return middle @ focal.T + center
+    return middle @ focal.T + center, square[:, 0].detach().abs() / points[:, 2].detach() ** 2
 
 
 def render(
@@ -125,7 +129,8 @@ def render(
 ) -> Rendering:
     """Render N surfels into C cameras; differentiable in every tensor.
 
-    `shifts` [C, N, H, W, 2] are added to the centres of the low-pass kernels, for each pixel by itself.
+    `shifts` [C, N, H, W, 2], in pixels, move a surfel in the image, for each pixel by itself: the gradient to
+    them (at zero) is a pixel's share of that to the surfel's place in the image.
     """
     means, quats, scales, opacities, colors, viewmats, Ks = doubles(
         means, quats, scales, opacities, colors, viewmats, Ks
@@ -144,14 +149,12 @@ def render(
         u_axes = axes[..., 0] * scales[index, :1] @ viewmat[:3, :3].T
         v_axes = axes[..., 1] * scales[index, 1:2] @ viewmat[:3, :3].T
 
-        u, v, t = intersect(points, u_axes, v_axes, rays(K, width, height))
+        pixels = grid[None] if shifts is None else grid - shifts[camera][index]
+        u, v, t = intersect(points, u_axes, v_axes, rays(K, pixels))
         ahead = t.detach() > 0
         disc = torch.where(ahead, u * u + v * v, float("inf"))
-        means2d = centers2d(points, u_axes, v_axes, K)
-        centers = means2d[:, None, None, :].expand(-1, height, width, 2)
-        if shifts is not None:
-            centers = centers + shifts[camera][index]
-        low_pass = 2 * ((grid - centers) ** 2).sum(-1)
+        means2d, whole = centers2d(points, u_axes, v_axes, K)
+        low_pass = 2 * ((pixels - means2d[:, None, None]) ** 2).sum(-1)
         hit = (disc <= low_pass).detach()
         raw = opacities[index, None, None] * torch.exp(-0.5 * torch.where(hit, disc, low_pass))
         z = torch.where(hit, t, points[:, 2, None, None])
@@ -161,8 +164,10 @@ def render(
         margin = torch.minimum(
             margin, smallest([(disc / low_pass - 1).detach().abs(), (before / 0.5 - 1).abs()], seen)
         )
+        steep = STEEP / steepness(points, u_axes, v_axes, K, pixels)
+        margin = torch.minimum(margin, smallest([steep], seen & hit))
+        margin = torch.minimum(margin, smallest([whole], seen & ~hit))
         kink = torch.minimum(torch.minimum(kink, margin), smallest([color_kinks, cosines], seen))
-        kink = torch.minimum(kink, smallest([STEEP / steepness(points, u_axes, v_axes, K, u, v)], seen & hit))
 
         blended = weights.detach() > 0
         last = torch.where(blended & (before > 0.5), torch.arange(1, len(index) + 1)[:, None, None], 0)
@@ -199,7 +204,7 @@ def depth_normals(depth: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
     images = []
     for z, viewmat, K in zip(depth, *doubles(viewmats, Ks), strict=True):
         height, width = z.shape
-        points = z[..., None] * rays(K, width, height)
+        points = z[..., None] * rays(K, pixel_grid(width, height))
         world = (points - viewmat[:3, 3]) @ torch.linalg.inv(viewmat[:3, :3]).T
         down = world[2:, 1:-1] - world[:-2, 1:-1]
         right = world[1:-1, 2:] - world[1:-1, :-2]
