@@ -15,8 +15,18 @@ Up to four channels are blended at once; more channels run again over the same l
 
 import warp as wp
 
-from gdpro_sim.kernels.lanes import CPU_FLAGS
-from gdpro_sim.kernels.projection import BOX, FACTOR, LOG2_CUTOFF, LOG2_OPACITY, MEAN, REACH, RECORD, TILE
+from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
+from gdpro_sim.kernels.projection import (
+    BOX,
+    CHANNELS,
+    FACTOR,
+    LOG2_CUTOFF,
+    LOG2_OPACITY,
+    MEAN,
+    REACH,
+    RECORD,
+    TILE,
+)
 
 wp.set_module_options(
     {
@@ -30,6 +40,7 @@ wp.set_module_options(
 ALPHA_MAX = wp.constant(0.99)
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
 LN2 = wp.constant(0.6931471805599453)
+BATCH_SIZE = 32
 
 LOCATE_TILE = f"""
     const int tiles_x = (width + {TILE - 1}) / {TILE}, tiles_y = (height + {TILE - 1}) / {TILE};
@@ -57,6 +68,7 @@ TILE_LANES = f"""
     const F column = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}};
     const F row = {{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
     const F block_x = 4.0f * column, block_y = 4.0f * row;
+    const I lane_number = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
     const F inside = (F)1.0f, outside = (F)-1.0f, zero = (F)0.0f;
     auto fma = [](F a, F b, F c) {{ return __builtin_elementwise_fma(a, b, c); }};
     auto bits = [](I mask) {{
@@ -68,28 +80,37 @@ TILE_LANES = f"""
     const int x_end = width - tile_x < {TILE} ? width - tile_x : {TILE};
     const int y_end = height - tile_y < {TILE} ? height - tile_y : {TILE};
 
+    // Read through volatile memory so that they stay in registers: as literals the compiler would fetch each
+    // anew at every block, through a 64-bit address.
+    const volatile float literals[] = {{12582912.0f, 1.3264727e-3f, 9.671513e-3f, 5.5507336e-2f, 2.4022242e-1f,
+        6.9314700e-1f, 1.0f, {float(ALPHA_MAX)!r}f, {float(LOG2_CUTOFF)!r}f, {float(TRANSMITTANCE_MIN)!r}f}};
+    const F magic = (F)literals[0], e5 = (F)literals[1], e4 = (F)literals[2], e3 = (F)literals[3],
+        e2 = (F)literals[4], e1 = (F)literals[5], one = (F)literals[6], alpha_max = (F)literals[7],
+        cutoff = (F)literals[8], transmittance_min = (F)literals[9];
+
     // Transmittance of the pixels of 16 blocks, with the sign as a flag: T > 0 goes on, T < 0 has stopped at |T|.
-    F T[16];
+    F T[16], X[16], Y[16];
     unsigned alive = 0;
     for (int k = 0; k < 16; ++k) {{
-        const F x = (float)(4 * (k & 3)) + column, y = (float)(4 * (k >> 2)) + row;
-        const I in = (x < (float)x_end) & (y < (float)y_end);
+        X[k] = (float)(4 * (k & 3)) + column;
+        Y[k] = (float)(4 * (k >> 2)) + row;
+        const I in = (X[k] < (float)x_end) & (Y[k] < (float)y_end);
         T[k] = in ? inside : outside;
         if (bits(in)) alive |= 1u << k;
     }}
 """
-"""CPU snippet: 16 pixel lanes, 16 blocks of 4 x 4 pixels in a tile; `alive` has a bit per block."""
+"""CPU snippet: 16 pixel lanes, 16 blocks of 4 x 4 pixels in a tile, at X, Y; `alive` has a bit per block."""
 
 EXP2 = """
             // exp2(p): p = n + f with |f| <= 1/2 through the 1.5 * 2^23 trick, then a degree-5 minimax polynomial
             // in f (relative error 2e-7) to whose exponent field n is added.
-            const F n = p + 12582912.0f;
-            const F f = p - (n - 12582912.0f);
-            F e = fma(f, (F)1.3264727e-3f, (F)9.671513e-3f);
-            e = fma(e, f, (F)5.5507336e-2f);
-            e = fma(e, f, (F)2.4022242e-1f);
-            e = fma(e, f, (F)6.9314700e-1f);
-            e = fma(e, f, (F)1.0f);
+            const F n = p + magic;
+            const F f = p - (n - magic);
+            F e = fma(f, e5, e4);
+            e = fma(e, f, e3);
+            e = fma(e, f, e2);
+            e = fma(e, f, e1);
+            e = fma(e, f, one);
             I exponent, mantissa;
             __builtin_memcpy(&exponent, &n, 64);
             __builtin_memcpy(&mantissa, &e, 64);
@@ -99,15 +120,14 @@ EXP2 = """
 """
 """CPU snippet: p -> raw = exp2(p), for -126 < p < 127."""
 
-BLEND = f"""
-            const F alpha = __builtin_elementwise_min(raw, (F){float(ALPHA_MAX)!r}f);
-            const F t = T[k];
+BLEND = """
+            const F alpha = raw < alpha_max ? raw : alpha_max;
             const F next = fma(-alpha, t, t);
-            const I seen = p >= {float(LOG2_CUTOFF)!r}f;
-            const I blend = seen & (next > {float(TRANSMITTANCE_MIN)!r}f);
+            const I seen = p >= cutoff;
+            const I blend = seen & (next > transmittance_min);
             const F w = blend ? alpha * t : zero;
 """
-"""CPU snippet: raw alpha of block k -> weights w of the lanes that blend."""
+"""CPU snippet: raw alpha and transmittance t -> weights w of the lanes that blend."""
 
 ADVANCE = """
             T[k] = blend ? next : t;
@@ -119,62 +139,115 @@ ADVANCE = """
 """
 """CPU snippet: transmittance behind block k."""
 
-ENTRY = f"""
-        const size_t g = (size_t)id[at];
-        if (end - at > 4) __builtin_prefetch(record + (size_t)id[at + 4] * {RECORD});
-        const float* const r = record + g * {RECORD};
-        const float dx = (float)tile_x + 0.5f - r[{MEAN}], dy = (float)tile_y + 0.5f - r[{MEAN + 1}];
-        const float a = r[{FACTOR}], b = r[{FACTOR + 1}], d = r[{FACTOR + 2}];
-
-        // Blocks the Gaussian can reach: their centre lies in the box grown by the block, and within
-        // `reach` of the mean where distance is counted in standard deviations.
-        const F bx = block_x + dx, by = block_y + dy;
-        const F u_block = fma((F)a, bx, b * by), v_block = d * by;
-        const F cu = u_block + 1.5f * (a + b), cv = v_block + 1.5f * d;
-        const I hit = (__builtin_elementwise_abs(bx + 1.5f) <= r[{BOX}] + 1.5f)
-            & (__builtin_elementwise_abs(by + 1.5f) <= r[{BOX + 1}] + 1.5f)
-            & (fma(cu, cu, cv * cv) <= r[{REACH}]);
-        unsigned mask = bits(hit) & alive;
-        if (!mask) continue;
-        *(F*)ub = u_block;
-        *(F*)vb = v_block;
-        const F u_lane = fma((F)a, column, b * row), v_lane = d * row;
-        const float l = r[{LOG2_OPACITY}];
-        const float* const c = colour + g * channel_stride;
-        const float r0 = c[0], r1 = c[1], r2 = c[2], r3 = c[3];
+PASS = """
+            const F passed = blend ? next : t;
+            t = (seen & ~blend) ? -__builtin_elementwise_abs(t) : passed;
 """
-"""CPU snippet: entry `at` of the list -> its record and the mask of blocks it reaches."""
+"""CPU snippet: transmittance t behind."""
 
-POWER = """
-            const F u = u_lane + ub[k], v = v_lane + vb[k];
-            const F p = fma(-v, v, fma(-u, u, (F)l));
+BATCH_STATE = f"""
+    float rows[{BATCH_SIZE}][{RECORD}] __attribute__((aligned(64)));
+    float u0[{BATCH_SIZE}] __attribute__((aligned(64))), v0[{BATCH_SIZE}] __attribute__((aligned(64)));
+    auto transpose = [](F* rows) {{{TRANSPOSE}
+    }};
+    const float* const record = records.data;
+    const float* const colour = channels.data + channel_offset;
+    const int channel_stride = channels.shape[1];
+    const bool own_channels = channels.data == records.data;
+    const int* const id = ids.data;
 """
-"""CPU snippet: base-2 logarithm p of alpha at the lanes of block k."""
+"""CPU snippet: what BATCH needs."""
+
+BATCH = f"""
+        // The next entries of the list, copied to `rows`, 16 at a time side by side in lanes: offset of the tile's
+        // first pixel from the mean, in pixels and whitened, and the blocks each can reach: those whose centre
+        // lies in the box grown by the block, and within `reach` of the mean in standard deviations.
+        const int held = end - at < {BATCH_SIZE} ? end - at : {BATCH_SIZE};
+        for (int first = 0; first < held; first += 16) {{
+            F fields[{RECORD}];
+            for (int j = 0; j < 16; ++j) {{
+                const int i = first + j < held ? first + j : held - 1;
+                __builtin_memcpy(&fields[j], record + (size_t)id[at + i] * {RECORD}, 64);
+                *(F*)rows[first + j] = fields[j];
+                if (!own_channels) {{
+                    __builtin_memcpy(rows[first + j] + {CHANNELS}, colour + (size_t)id[at + i] * channel_stride, 16);
+                }}
+                if (i + {BATCH_SIZE} < end - at) {{
+                    __builtin_prefetch(record + (size_t)id[at + i + {BATCH_SIZE}] * {RECORD});
+                }}
+            }}
+            transpose(fields);
+            const F a = fields[{FACTOR}], b = fields[{FACTOR + 1}], d = fields[{FACTOR + 2}];
+            const F dx = (float)tile_x + 0.5f - fields[{MEAN}], dy = (float)tile_y + 0.5f - fields[{MEAN + 1}];
+            *(F*)(u0 + first) = fma(a, dx, b * dy);
+            *(F*)(v0 + first) = d * dy;
+            const F reach_x = fields[{BOX}] + 1.5f, reach_y = fields[{BOX + 1}] + 1.5f;
+            F along[4], across[4], square[4];
+            I in_x[4], in_y[4];
+            const I there = first + lane_number < held;
+            for (int i = 0; i < 4; ++i) {{
+                const F cx = dx + (4.0f * i + 1.5f), cy = dy + (4.0f * i + 1.5f), cv = d * cy;
+                in_x[i] = (__builtin_elementwise_abs(cx) <= reach_x) & there;
+                in_y[i] = __builtin_elementwise_abs(cy) <= reach_y;
+                along[i] = a * cx;
+                across[i] = b * cy;
+                square[i] = cv * cv;
+            }}
+            {{declare}}
+            for (int k = 0; k < 16; ++k) {{
+                const F cu = along[k & 3] + across[k >> 2];
+                const I hit = in_x[k & 3] & in_y[k >> 2] & (fma(cu, cu, square[k >> 2]) <= fields[{REACH}]);
+                {{each}}
+            }}
+            {{end}}
+        }}
+"""
+"""CPU snippet: list from `at` on -> `held` entries in `rows`, u0, v0; {{each}} takes the mask `hit` of the 16 entries
+from `first` on that reach block k, between {{declare}} and {{end}}."""
+
+POWER = f"""
+            const float* const r = rows[i];
+            const float a = r[{FACTOR}], b = r[{FACTOR + 1}], d = r[{FACTOR + 2}];
+            const F u = fma((F)a, x, fma((F)b, y, (F)u0[i])), v = fma((F)d, y, (F)v0[i]);
+            const F p = fma(-v, v, fma(-u, u, (F)r[{LOG2_OPACITY}]));
+"""
+"""CPU snippet: base-2 logarithm p of alpha of entry i of the batch at the lanes x, y."""
+
+_BATCH = (
+    BATCH.replace("{declare}", "").replace("{each}", "entries[k] |= bits(hit) << first;").replace("{end}", "")
+)
 
 _TILE = f"""
 #if !defined(__CUDACC__)
 {LOCATE_TILE}{TILE_LANES}
+{BATCH_STATE}
     F c0[16], c1[16], c2[16], c3[16];
     for (int k = 0; k < 16; ++k) c0[k] = c1[k] = c2[k] = c3[k] = zero;
-    float ub[16] __attribute__((aligned(64))), vb[16] __attribute__((aligned(64)));
-    const float* const record = records.data;
-    const float* const colour = channels.data + channel_offset;
-    const int channel_stride = channels.shape[1];
-    const int* const id = ids.data;
     const int end = offsets.data[tile + 1];
     int at = begin;
-    for (; at < end && alive; ++at) {{
-{ENTRY}
-        do {{
-            const int k = __builtin_ctz(mask);
-            mask &= mask - 1;
-{POWER}{EXP2}{BLEND}
-            c0[k] = fma(w, (F)r0, c0[k]);
-            c1[k] = fma(w, (F)r1, c1[k]);
-            c2[k] = fma(w, (F)r2, c2[k]);
-            if (count > 3) c3[k] = fma(w, (F)r3, c3[k]);
-{ADVANCE}
-        }} while (mask);
+    while (at < end && alive) {{
+        unsigned entries[16] = {{0}};
+{_BATCH}
+        // Block after block, so that its transmittance and colours stay in registers over the batch.
+        for (unsigned blocks = alive; blocks; blocks &= blocks - 1) {{
+            const int k = __builtin_ctz(blocks);
+            unsigned left = entries[k];
+            if (!left) continue;
+            const F x = X[k], y = Y[k];
+            F t = T[k], k0 = c0[k], k1 = c1[k], k2 = c2[k], k3 = c3[k];
+            do {{
+                const int i = __builtin_ctz(left);
+                left &= left - 1;
+{POWER}{EXP2}{BLEND}{PASS}
+                k0 = fma(w, (F)r[{CHANNELS}], k0);
+                k1 = fma(w, (F)r[{CHANNELS + 1}], k1);
+                k2 = fma(w, (F)r[{CHANNELS + 2}], k2);
+                k3 = fma(w, (F)r[{CHANNELS + 3}], k3);
+            }} while (left);
+            T[k] = t, c0[k] = k0, c1[k] = k1, c2[k] = k2, c3[k] = k3;
+            if (!bits(t > 0.0f)) alive &= ~(1u << k);
+        }}
+        at += held;
     }}
 
     // Write what lies inside the image, over the background; expected depth is divided by alpha.

@@ -14,14 +14,16 @@ pixels of the absolute gradient at MEAN (of `absgrad`, Ye et al., "AbsGS", 2024)
 import warp as wp
 
 from gdpro_sim.kernels.compositing import (
-    ADVANCE,
     ALPHA_MAX,
+    BATCH,
+    BATCH_SIZE,
+    BATCH_STATE,
     BLEND,
-    ENTRY,
     EXP2,
     LN2,
     LOCATE_PIXEL,
     LOCATE_TILE,
+    PASS,
     POWER,
     TILE_LANES,
 )
@@ -79,6 +81,18 @@ _PIXEL_GRADIENT = """
 """
 """Snippet: `pixel` -> gradient[i] at its sums and `behind`, the first R."""
 
+_BATCH = (
+    BATCH.replace("{declare}", "I reached = (I)0;")
+    .replace("{each}", "reached |= hit & (1 << k);")
+    .replace(
+        "{end}",
+        """*(I*)(masks + first) = reached;
+            for (int j = 0; j < 16 && first + j < held; ++j) {
+                __builtin_prefetch(sums_out.data + (size_t)id[at + first + j] * 16, 1);
+            }""",
+    )
+)
+
 _TILE = f"""
 #if !defined(__CUDACC__)
 {LOCATE_TILE}{TILE_LANES}{SUM_LANES}{IN_SLAB}
@@ -100,61 +114,67 @@ _TILE = f"""
         }}
     }}
 
-    float ub[16] __attribute__((aligned(64))), vb[16] __attribute__((aligned(64)));
-    float xb[16] __attribute__((aligned(64))), yb[16] __attribute__((aligned(64)));
-    const float* const record = records.data;
-    const float* const colour = channels.data + channel_offset;
-    const int channel_stride = channels.shape[1];
-    const int* const id = ids.data;
+{BATCH_STATE}
     const int end = stops.data[tile];
     const int WIDTH = {RECORD};
     // Factors of the chain rule that all lanes share: exp2 and squares, see below.
     const float s = {2 * LN2!r}f;
     const F factors = {{s, s, s, s, s, s, s, s, 1, 1, 1, 1, s, s, s, s}};
-    for (int at = begin; at < end; ++at) {{
-{ENTRY}
-        *(F*)xb = bx;
-        *(F*)yb = by;
-        F sum_p = zero, sum_u = zero, sum_v = zero, sum_ux = zero, sum_uy = zero, sum_vy = zero;
-        F sum_0 = zero, sum_1 = zero, sum_2 = zero, sum_3 = zero, abs_x = zero, abs_y = zero;
-        do {{
-            const int k = __builtin_ctz(mask);
-            mask &= mask - 1;
+    for (int at = begin; at < end;) {{
+        int masks[{BATCH_SIZE}] __attribute__((aligned(64)));
+{_BATCH}
+        for (int i = 0; i < held; ++i) {{
+            unsigned mask = (unsigned)masks[i] & alive;
+            if (!mask) continue;
+            const size_t g = (size_t)id[at + i];
+            F sum_p = zero, sum_u = zero, sum_v = zero, sum_ux = zero, sum_uy = zero, sum_vy = zero;
+            F sum_0 = zero, sum_1 = zero, sum_2 = zero, sum_3 = zero, abs_x = zero, abs_y = zero;
+            do {{
+                const int k = __builtin_ctz(mask);
+                mask &= mask - 1;
+                const F x = X[k], y = Y[k];
+                F t = T[k];
 {POWER}{EXP2}{BLEND}
-            F q = fma((F)r0, g0[k], fma((F)r1, g1[k], r2 * g2[k]));
-            if (count > 3) q = fma((F)r3, g3[k], q);
-            const F behind = fma(-w, q, R[k]);
-            R[k] = behind;
-            const F g_alpha = fma(t, q, -behind / (1.0f - alpha));
-            const F g_p = (blend & (raw <= {float(ALPHA_MAX)!r}f)) ? g_alpha * raw : zero;
-            const F g_u = g_p * u, g_v = g_p * v;
-            sum_p += g_p;
-            sum_u += g_u;
-            sum_v += g_v;
-            sum_ux = fma((F)xb[k], g_u, sum_ux);
-            sum_uy = fma((F)yb[k], g_u, sum_uy);
-            sum_vy = fma((F)yb[k], g_v, sum_vy);
-            sum_0 = fma(w, g0[k], sum_0);
-            sum_1 = fma(w, g1[k], sum_1);
-            sum_2 = fma(w, g2[k], sum_2);
-            if (count > 3) sum_3 = fma(w, g3[k], sum_3);
-            if (absolute) {{
-                abs_x += __builtin_elementwise_abs(a * g_u);
-                abs_y += __builtin_elementwise_abs(fma((F)b, g_u, d * g_v));
-            }}
-{ADVANCE}
-        }} while (mask);
+                F q = fma((F)r[{CHANNELS}], g0[k], fma((F)r[{CHANNELS + 1}], g1[k], r[{CHANNELS + 2}] * g2[k]));
+                if (count > 3) q = fma((F)r[{CHANNELS + 3}], g3[k], q);
+                const F behind = fma(-w, q, R[k]);
+                R[k] = behind;
+                const F g_alpha = fma(t, q, -behind / (one - alpha));
+                const F g_p = (blend & (raw <= alpha_max)) ? g_alpha * raw : zero;
+                const F g_u = g_p * u, g_v = g_p * v;
+                sum_p += g_p;
+                sum_u += g_u;
+                sum_v += g_v;
+                sum_ux = fma(x, g_u, sum_ux);
+                sum_uy = fma(y, g_u, sum_uy);
+                sum_vy = fma(y, g_v, sum_vy);
+                sum_0 = fma(w, g0[k], sum_0);
+                sum_1 = fma(w, g1[k], sum_1);
+                sum_2 = fma(w, g2[k], sum_2);
+                if (count > 3) sum_3 = fma(w, g3[k], sum_3);
+                if (absolute) {{
+                    abs_x += __builtin_elementwise_abs(a * g_u);
+                    abs_y += __builtin_elementwise_abs(fma((F)b, g_u, d * g_v));
+                }}
+{PASS}
+                T[k] = t;
+                if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
+            }} while (mask);
 {SPILL}
-        // p = l - u^2 - v^2, u = a dx + b dy, v = d dy, where dx, dy are block offset plus lane offset.
-        const F sums[16] = {{
-            a * sum_u, fma((F)b, sum_u, d * sum_v),
-            -fma(column, sum_u, sum_ux), -fma(row, sum_u, sum_uy), -fma(row, sum_v, sum_vy),
-            zero, 0.5f * sum_p, zero, sum_0, sum_1, sum_2, sum_3, abs_x, abs_y, zero, zero,
-        }};
-        F total;
-        __builtin_memcpy(&total, out, 64);
-        total += sum_lanes(sums) * factors;
-        __builtin_memcpy(out, &total, 64);
+            // p = l - u^2 - v^2, u = a dx + b dy, v = d dy, with dx, dy from the mean: X, Y plus those of the tile.
+            const float* const r = rows[i];
+            const float dx = (float)tile_x + 0.5f - r[{MEAN}], dy = (float)tile_y + 0.5f - r[{MEAN + 1}];
+            const F sums[16] = {{
+                r[{FACTOR}] * sum_u, fma((F)r[{FACTOR + 1}], sum_u, r[{FACTOR + 2}] * sum_v),
+                -fma((F)dx, sum_u, sum_ux), -fma((F)dy, sum_u, sum_uy), -fma((F)dy, sum_v, sum_vy),
+                zero, 0.5f * sum_p, zero, sum_0, sum_1, sum_2, sum_3, abs_x, abs_y, zero, zero,
+            }};
+            F total;
+            __builtin_memcpy(&total, out, 64);
+            total += sum_lanes(sums) * factors;
+            __builtin_memcpy(out, &total, 64);
+        }}
+        at += held;
     }}
 #endif
 """

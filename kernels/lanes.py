@@ -38,7 +38,7 @@ def _shuffles(half: int) -> tuple[str, str]:
     return ", ".join(map(str, low)), ", ".join(map(str, high))
 
 
-_TRANSPOSE = "".join(
+TRANSPOSE = "".join(
     f"""
         for (int i = 0; i < 16; ++i) {{
             if (i & {half}) continue;
@@ -48,6 +48,8 @@ _TRANSPOSE = "".join(
         }}"""
     for half in (8, 4, 2, 1)
 )
+
+"""CPU text: transposes the 16 vectors F of `rows`."""
 
 SUM_LANES = (
     "".join(
@@ -117,7 +119,7 @@ PRELUDE = (
         for (int j = 0; j < 16; ++j) if (j < lanes) p[j * stride] += v[j];
     };
     auto transpose = [](F* rows) {"""
-    + _TRANSPOSE
+    + TRANSPOSE
     + """
     };
     auto load_rows = [&](const float* p, int stride, F* rows) {
@@ -166,4 +168,4 @@ PRELUDE = (
 """
 )
 
-__all__ = ["CPU_FLAGS", "PRELUDE", "SUM_LANES"]
+__all__ = ["CPU_FLAGS", "PRELUDE", "SUM_LANES", "TRANSPOSE"]

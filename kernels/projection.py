@@ -59,10 +59,11 @@ SLACK = wp.constant(1.0001)
 """Boxes grow by this factor so that rounding cannot push a pixel at the cutoff outside."""
 
 ROTATION = """
-    // Rotation matrix q of quaternions wxyz of any nonzero length; NaN for zero.
+    // Rotation matrix q of quaternions wxyz of any length but (nearly) zero: NaN there.
     const float* const quat = (const float*)(quats.data + n);
     const F qw0 = load(quat, 4), qx0 = load(quat + 1, 4), qy0 = load(quat + 2, 4), qz0 = load(quat + 3, 4);
-    const F longest = max_(max_(abs_(qw0), abs_(qx0)), max_(abs_(qy0), abs_(qz0)));
+    const F largest_q = max_(max_(abs_(qw0), abs_(qx0)), max_(abs_(qy0), abs_(qz0)));
+    const F longest = select(largest_q > 1e-30f, largest_q, splat(0.0f));
     const F qw1 = qw0 / longest, qx1 = qx0 / longest, qy1 = qy0 / longest, qz1 = qz0 / longest;
     const F unit = 1.0f / sqrt_(qw1 * qw1 + qx1 * qx1 + qy1 * qy1 + qz1 * qz1);
     const F qw = qw1 * unit, qx = qx1 * unit, qy = qy1 * unit, qz = qz1 * unit;
@@ -137,6 +138,40 @@ FACTORS = f"""
 """
 """Snippet: the Cholesky factor of the inverse blurred covariance, times sqrt(log2(e) / 2)."""
 
+PIXEL_BOX = """
+    // Pixels whose centre lies in the box, then the tiles they lie in (end exclusive).
+    const F x0 = max_(ceil_(mean_x - box_x - 0.5f), splat(0.0f));
+    const F y0 = max_(ceil_(mean_y - box_y - 0.5f), splat(0.0f));
+    const F x1 = min_(floor_(mean_x + box_x - 0.5f), splat((float)(width - 1)));
+    const F y1 = min_(floor_(mean_y + box_y - 0.5f), splat((float)(height - 1)));
+"""
+"""Snippet: box of half extents box_x, box_y around mean_x, mean_y -> first and last pixels x0, y0, x1, y1."""
+
+BIN = f"""
+    const F largest = splat(1.0e9f);
+    const I radius_x = to_int(select(drawn, min_(ceil_(box_x), largest), zero));
+    const I radius_y = to_int(select(drawn, min_(ceil_(box_y), largest), zero));
+    const F tile = splat({1 / TILE!r}f);
+    const I begin_x = to_int(select(drawn, x0 * tile, zero)), begin_y = to_int(select(drawn, y0 * tile, zero));
+    const I end_x = to_int(select(drawn, x1 * tile + 1.0f, zero));
+    const I end_y = to_int(select(drawn, y1 * tile + 1.0f, zero));
+    const F key = select(drawn, z, splat(1.0f / 0.0f));
+    store(keys_out.data + (size_t)camera * keys_out.shape[1] + n, 1, key);
+    int* const radius = (int*)(radii_out.data + first);
+    short* const rect = (short*)(rects_out.data + first);
+    int* const order = order_out.data + (size_t)camera * order_out.shape[1] + n;
+    for (int j = 0; j < lanes; ++j) {{
+        radius[2 * j] = lane_int(radius_x, j);
+        radius[2 * j + 1] = lane_int(radius_y, j);
+        rect[4 * j] = (short)lane_int(begin_x, j);
+        rect[4 * j + 1] = (short)lane_int(begin_y, j);
+        rect[4 * j + 2] = (short)lane_int(end_x, j);
+        rect[4 * j + 3] = (short)lane_int(end_y, j);
+        order[j] = (int)first + j;
+    }}
+"""
+"""Snippet: `drawn`, z, the box and its pixels -> radii, tiles touched, sort key and number."""
+
 _PROJECT = f"""
     const int groups = (means.shape[0] + lanes_per_group - 1) / lanes_per_group;
     const int camera = group / groups;
@@ -155,12 +190,7 @@ _PROJECT = f"""
     const F box_x = extent * deviation_x * {SLACK / SQRT_HALF_LOG2_E!r}f;
     const F box_y = extent * deviation_y * {SLACK / SQRT_HALF_LOG2_E!r}f;
 
-    // Pixels whose centre lies in the box, then the tiles they lie in (end exclusive).
-    const F x0 = max_(ceil_(mean_x - box_x - 0.5f), splat(0.0f));
-    const F y0 = max_(ceil_(mean_y - box_y - 0.5f), splat(0.0f));
-    const F x1 = min_(floor_(mean_x + box_x - 0.5f), splat((float)(width - 1)));
-    const F y1 = min_(floor_(mean_y + box_y - 0.5f), splat((float)(height - 1)));
-    // A sum of magnitudes is finite only where all its terms are.
+{PIXEL_BOX}    // A sum of magnitudes is finite only where all its terms are.
     const F size = abs_(mean_x) + abs_(mean_y) + a + abs_(b) + d + box_x + box_y + opacity + blurred_det;
     I drawn = (z >= near) & (z <= far) & (z > 0.0f) & (extent2 >= 0.0f) & (opacity > 0.0f) & finite(size)
         & (x0 <= x1) & (y0 <= y1) & ((box_x > radius_clip) | (box_y > radius_clip));
@@ -203,28 +233,7 @@ _PROJECT = f"""
     float* const record = records_out.data + first * 16;
     for (int i = 0; i < 16; ++i) fields[i] = select(drawn, fields[i], zero);
     store_rows(record, 16, fields);
-    const F largest = splat(1.0e9f);
-    const I radius_x = to_int(select(drawn, min_(ceil_(box_x), largest), zero));
-    const I radius_y = to_int(select(drawn, min_(ceil_(box_y), largest), zero));
-    const F tile = splat({1 / TILE!r}f);
-    const I begin_x = to_int(select(drawn, x0 * tile, zero)), begin_y = to_int(select(drawn, y0 * tile, zero));
-    const I end_x = to_int(select(drawn, x1 * tile + 1.0f, zero));
-    const I end_y = to_int(select(drawn, y1 * tile + 1.0f, zero));
-    const F key = select(drawn, z, splat(1.0f / 0.0f));
-    store(keys_out.data + (size_t)camera * keys_out.shape[1] + n, 1, key);
-    int* const radius = (int*)(radii_out.data + first);
-    short* const rect = (short*)(rects_out.data + first);
-    int* const order = order_out.data + (size_t)camera * order_out.shape[1] + n;
-    for (int j = 0; j < lanes; ++j) {{
-        radius[2 * j] = lane_int(radius_x, j);
-        radius[2 * j + 1] = lane_int(radius_y, j);
-        rect[4 * j] = (short)lane_int(begin_x, j);
-        rect[4 * j + 1] = (short)lane_int(begin_y, j);
-        rect[4 * j + 2] = (short)lane_int(end_x, j);
-        rect[4 * j + 3] = (short)lane_int(end_y, j);
-        order[j] = (int)first + j;
-    }}
-"""
+{BIN}"""
 
 
 @wp.func_native(_PROJECT)

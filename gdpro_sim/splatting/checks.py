@@ -67,6 +67,32 @@ def check_count(what: str, count: int, limit: int = INDEX_LIMIT) -> int:
     return count
 
 
+def check_colors(
+    colors: object, sh_degree: int | None, cameras: int, count: int, means: torch.Tensor
+) -> torch.Tensor:
+    """Return `colors` for C cameras and N Gaussians: [N, K, 3] where `sh_degree` is given, else [(C,) N, D].
+
+    Raises ValueError.
+    """
+    if sh_degree is None:
+        if isinstance(colors, torch.Tensor) and colors.ndim == 3:
+            colors = check_tensor("colors", colors, (cameras, count, "D"), means)
+        else:
+            colors = check_tensor("colors", colors, (count, "D"), means)
+        if colors.shape[-1] < 1:
+            raise ValueError(f"colors must have at least one channel, got shape {list(colors.shape)}")
+        return colors
+    if isinstance(sh_degree, bool) or not isinstance(sh_degree, int) or not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree must be 0, 1, 2, 3 or None, got {sh_degree!r}")
+    colors = check_tensor("colors", colors, (count, "K", 3), means)
+    if colors.shape[1] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"colors must hold at least {(sh_degree + 1) ** 2} coefficients for sh_degree {sh_degree}, "
+            f"got shape {list(colors.shape)}"
+        )
+    return colors
+
+
 GSPLAT_ARGUMENTS: dict[str, tuple[object, ...]] = {
     "packed": (False,),
     "tile_size": (16,),
@@ -99,6 +125,7 @@ def check_gsplat_arguments(arguments: dict[str, object]) -> None:
 __all__ = [
     "INDEX_LIMIT",
     "check_choice",
+    "check_colors",
     "check_count",
     "check_gsplat_arguments",
     "check_number",

@@ -76,7 +76,8 @@ def composite(
             assert features is not None
             source = pack_channels(projection, features, first)
         last = min(first + GROUP, channels)
-        blending = Blending(view, last - first, divided - first, tile, absgrad)
+        inside = divided - first if first <= divided < last else -1
+        blending = Blending(view, last - first, inside, tile, absgrad)
         parts.append(blend(projection, lists, source, backgrounds[:, first:last], blending))
     if len(parts) == 1:
         return parts[0]
@@ -171,8 +172,16 @@ class _Blend(torch.autograd.Function):
         g_image = torch.zeros_like(image) if g_image is None else g_image.contiguous()
         g_alphas = image.new_empty(0) if g_alphas is None else g_alphas.contiguous()
         blending: Blending = ctx.blending
-        if len(records) == 0 or len(image) == 0:
-            return torch.zeros_like(records), torch.zeros_like(means2d), None, None, None, None, None
+        g_backgrounds = None
+        if ctx.needs_input_grad[3]:
+            with serial_torch():
+                pixels = blending.view.height * blending.view.width
+                covered = (transmittance[:, None] * g_image).view(ctx.cameras, pixels, blending.count)
+                g_backgrounds = covered.double().sum(1).float()
+                if blending.divided >= 0:
+                    g_backgrounds[:, blending.divided] = 0.0
+        if len(records) == 0:
+            return torch.zeros_like(records), torch.zeros_like(means2d), None, g_backgrounds, None, None, None
         with torch_stream(records):
             sums = gradient_sums(
                 records, channels, ctx.lists, rects, stops, image, transmittance, g_image, g_alphas, blending
@@ -186,15 +195,6 @@ class _Blend(torch.autograd.Function):
         if channels is not None:
             g_channels = sums[:, CHANNELS : CHANNELS + GROUP].clone()
             sums[:, CHANNELS : CHANNELS + GROUP] = 0.0
-        g_backgrounds = None
-        if ctx.needs_input_grad[3]:
-            with serial_torch():
-                covered = transmittance.view(ctx.cameras, -1, 1) * g_image.view(
-                    ctx.cameras, -1, blending.count
-                )
-                g_backgrounds = covered.double().sum(1).float()
-                if blending.divided >= 0:
-                    g_backgrounds[:, blending.divided] = 0.0
         return sums, g_means2d, g_channels, g_backgrounds, None, None, None
 
 
@@ -248,6 +248,29 @@ def gradient_sums(
     return sums
 
 
+def weigh(
+    projection: Projection, lists: TileLists, result: Composite, view: View, tile: bool, values: torch.Tensor
+) -> torch.Tensor:
+    """Sums over pixels of blending weight times `values` [C H W, count <= 4]: [M, count], without gradients."""
+    count = values.shape[1]
+    if len(projection.records) == 0:
+        return values.new_zeros((0, count))
+    # The gradient of an image at the colours is the sum of weight times the image's gradient.
+    sums = gradient_sums(
+        projection.records.detach(),
+        None,
+        lists,
+        projection.rects,
+        result.stops,
+        torch.zeros_like(values),
+        result.transmittance.reshape(-1),
+        values,
+        values.new_empty(0),
+        Blending(view, count, -1, tile, False),
+    )
+    return sums[:, CHANNELS : CHANNELS + count]
+
+
 def _sources(records: torch.Tensor, channels: torch.Tensor | None, lists: TileLists) -> list[Any]:
     source, offset = (records, int(CHANNELS)) if channels is None else (channels, 0)
     return [
@@ -276,4 +299,4 @@ def _launch_tiles(offsets: torch.Tensor, arguments: list[Any]) -> None:
     run_chunks(launch, threads)
 
 
-__all__ = ["GROUP", "Blending", "Composite", "blend", "composite", "gradient_sums", "pack_channels"]
+__all__ = ["GROUP", "Blending", "Composite", "blend", "composite", "gradient_sums", "pack_channels", "weigh"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,13 +12,14 @@ from gdpro_sim.device import torch_stream
 from gdpro_sim.splatting.checks import (
     INDEX_LIMIT,
     check_choice,
+    check_colors,
     check_count,
     check_gsplat_arguments,
     check_number,
     check_size,
     check_tensor,
 )
-from gdpro_sim.splatting.compositing import Blending, Composite, blend, composite
+from gdpro_sim.splatting.compositing import Blending, blend, composite, weigh
 from gdpro_sim.splatting.normals import shortest_axes
 from gdpro_sim.splatting.projection import Projection, View, project
 from gdpro_sim.splatting.tiles import TileLists, count_and_fill, empty_lists, expand_and_sort
@@ -111,7 +113,7 @@ def rasterization(
         transmittance [C, H, W]                                      what reaches the background
         normals [C, H, W, 3], with RasterOptions(normals=True)       sum of weight times the Gaussian's shortest
                                                                      axis, in world space, towards the camera
-        projection, tile_lists, composite, blending                  the stages' own results
+        projection, tile_lists, composite, weigh                     the stages' own results
     means2d, depths, opacities and normals carry gradients; `means2d.retain_grad()` works as with gsplat.
 
     A Gaussian is not drawn where its parameters or colour hold NaN or infinity, or its quaternion is zero.
@@ -143,7 +145,7 @@ def rasterization(
     check_choice("render_mode", render_mode, RENDER_MODES)
     with_colors = render_mode.startswith("RGB")
     with_depth = render_mode != "RGB"
-    colors = _check_colors(colors, sh_degree, cameras, count, means)
+    colors = check_colors(colors, sh_degree, cameras, count, means)
     features = 0 if not with_colors else 3 if sh_degree is not None else colors.shape[-1]
     channels = features + with_depth
     background = means.new_zeros((cameras, channels))
@@ -173,7 +175,6 @@ def rasterization(
             gaussians, flat, degree, view, options.max_tile_entries, tile=tile
         )
         result = composite(projection, lists, flat, background, divided, view, tile=tile, absgrad=absgrad)
-    blending = Blending(view, 3, -1, tile, absgrad)
     meta: dict[str, Any] = {
         "width": width,
         "height": height,
@@ -191,12 +192,12 @@ def rasterization(
         "projection": projection,
         "tile_lists": lists,
         "composite": result,
-        "blending": blending,
+        "weigh": partial(weigh, projection, lists, result, view, tile),
     }
     if options.normals:
         axes = torch.nn.functional.pad(shortest_axes(means, quats, scales, viewmats), (0, 1)).flatten(0, 1)
         with torch_stream(means):
-            nothing = means.new_zeros((cameras, 3))
+            nothing, blending = means.new_zeros((cameras, 3)), Blending(view, 3, -1, tile, absgrad)
             meta["normals"] = blend(projection, lists, axes, nothing, blending).image
     return result.image, result.alphas, meta
 
@@ -224,28 +225,6 @@ def _project_and_bin(
         return nothing, empty_lists(cameras, view, means.device)
     projection = project(gaussians, colors, degree, view)
     return projection, (count_and_fill if tile else expand_and_sort)(projection, view, limit)
-
-
-def _check_colors(
-    colors: object, sh_degree: int | None, cameras: int, count: int, means: torch.Tensor
-) -> torch.Tensor:
-    if sh_degree is None:
-        if isinstance(colors, torch.Tensor) and colors.ndim == 3:
-            colors = check_tensor("colors", colors, (cameras, count, "D"), means)
-        else:
-            colors = check_tensor("colors", colors, (count, "D"), means)
-        if colors.shape[-1] < 1:
-            raise ValueError(f"colors must have at least one channel, got shape {list(colors.shape)}")
-        return colors
-    if isinstance(sh_degree, bool) or not isinstance(sh_degree, int) or not 0 <= sh_degree <= 3:
-        raise ValueError(f"sh_degree must be 0, 1, 2, 3 or None, got {sh_degree!r}")
-    colors = check_tensor("colors", colors, (count, "K", 3), means)
-    if colors.shape[1] < (sh_degree + 1) ** 2:
-        raise ValueError(
-            f"colors must hold at least {(sh_degree + 1) ** 2} coefficients for sh_degree {sh_degree}, "
-            f"got shape {list(colors.shape)}"
-        )
-    return colors
 
 
 __all__ = ["RasterOptions", "rasterization"]
