@@ -18,20 +18,22 @@ what is not colour. `surfel_tile` is for CPUs, one index per tile, `surfel_pixel
 import warp as wp
 
 from gdpro_sim.kernels.compositing import (
-    ADVANCE,
     ALPHA_MAX,
+    BATCH_SIZE,
     EXP2,
     LN2,
     LOCATE_PIXEL,
     LOCATE_TILE,
+    PASS,
     TILE_LANES,
     TRANSMITTANCE_MIN,
 )
-from gdpro_sim.kernels.lanes import CPU_FLAGS
+from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
 from gdpro_sim.kernels.projection import LOG2_CUTOFF
 from gdpro_sim.kernels.surfels import (
     BOX,
     CENTER,
+    CHANNELS,
     DEPTH,
     EXTENT,
     LOG2_E,
@@ -93,7 +95,6 @@ SCALAR = f"""
         cutoff = {float(LOG2_CUTOFF)!r}f;
     const F transmittance_min = {float(TRANSMITTANCE_MIN)!r}f, nearest = {NEAREST!r}f, log2_e = {LOG2_E!r}f;
     const int SIZE = 1, k = 0;
-    F T[1] = {{one}};
 """
 """Snippet: one pixel, number 0 of arrays of one, for the text below."""
 
@@ -102,63 +103,114 @@ EXP = f"""
 """
 """Snippet for one pixel: p -> raw = exp2(p)."""
 
-RECORD_FIELDS = f"""
-        const float u_x = r[{U}], u_y = r[{U + 1}], v_x = r[{V}], v_y = r[{V + 1}];
-        const float w_x = r[{SLOPE}], w_y = r[{SLOPE + 1}], depth = r[{DEPTH}];
-        const float nx = r[{NORMAL}], ny = r[{NORMAL + 1}], nz = r[{NORMAL + 2}], l = r[{LOG2_OPACITY}];
-        const float r0 = c[0], r1 = c[1], r2 = c[2];
+BATCH_STATE = f"""
+    float rows[{BATCH_SIZE}][{RECORD}] __attribute__((aligned(64)));
+    float u0[{BATCH_SIZE}] __attribute__((aligned(64))), v0[{BATCH_SIZE}] __attribute__((aligned(64)));
+    float w0[{BATCH_SIZE}] __attribute__((aligned(64)));
+    float mx0[{BATCH_SIZE}] __attribute__((aligned(64))), my0[{BATCH_SIZE}] __attribute__((aligned(64)));
+    auto transpose = [](F* rows) {{{TRANSPOSE}
+    }};
+    const float* const record = records.data;
+    const float* const colour = channels.data + channel_offset;
+    const int channel_stride = channels.shape[1];
+    const bool own_channels = channels.data == records.data;
+    const int* const id = ids.data;
 """
+"""CPU snippet: what BATCH needs."""
 
-ENTRY = f"""
-        const size_t g = (size_t)id[at];
-        if (end - at > 4) {{
-            __builtin_prefetch(record + (size_t)id[at + 4] * {RECORD});
-            __builtin_prefetch(record + (size_t)id[at + 4] * {RECORD} + 16);
+BATCH = f"""
+        // The next entries of the list, copied to `rows`, 16 at a time side by side in lanes: U . e, V . e, W
+        // and the offset from the mean at the tile's first pixel, and the blocks each can reach. Those touch
+        // its box, and its low-pass, a circle, or its disc: within a block (U . e, V . e) varies by REACH and
+        // W by `turn` at most.
+        const int held = end - at < {BATCH_SIZE} ? end - at : {BATCH_SIZE};
+        for (int first = 0; first < held; first += 16) {{
+            F fields[16];
+            for (int j = 0; j < 16; ++j) {{
+                const int i = first + j < held ? first + j : held - 1;
+                const float* const from = record + (size_t)id[at + i] * {RECORD};
+                __builtin_memcpy(&fields[j], from, 64);
+                __builtin_memcpy(rows[first + j], from, {4 * RECORD});
+                if (!own_channels) {{
+                    __builtin_memcpy(rows[first + j] + {CHANNELS}, colour + (size_t)id[at
+                        + i] * channel_stride, 12);
+                }}
+                if (i + {BATCH_SIZE} < end - at) {{
+                    const float* const next = record + (size_t)id[at + i + {BATCH_SIZE}] * {RECORD};
+                    __builtin_prefetch(next);
+                    __builtin_prefetch(next + 16);
+                }}
+            }}
+            transpose(fields);
+            const F u_x = fields[{U}], u_y = fields[{U + 1}], v_x = fields[{V}], v_y = fields[{V + 1}];
+            const F w_x = fields[{SLOPE}], w_y = fields[{SLOPE + 1}];
+            const F x0 = (F)((float)tile_x + 0.5f), y0 = (F)((float)tile_y + 0.5f);
+            const F ex = x0 - fields[{CENTER}], ey = y0 - fields[{CENTER + 1}];
+            const F mx = x0 - fields[{MEAN}], my = y0 - fields[{MEAN + 1}];
+            const F u = fma(u_x, ex, u_y * ey), v = fma(v_x, ex, v_y * ey),
+                w = fma(w_x, ex, fma(w_y, ey, one));
+            *(F*)(u0 + first) = u;
+            *(F*)(v0 + first) = v;
+            *(F*)(w0 + first) = w;
+            *(F*)(mx0 + first) = mx;
+            *(F*)(my0 + first) = my;
+            const F turn = 1.5f * (abs_(w_x) + abs_(w_y));
+            const F blur = fields[{EXTENT}] * {LOG2_E**-0.5!r}f + 1.5f;
+            const F half_x = fields[{BOX + 2}] + 1.5f, half_y = fields[{BOX + 3}] + 1.5f;
+            F across_u[4], across_v[4], across_w[4], down_u[4], down_v[4], down_w[4];
+            I in_x[4], in_y[4], blur_x[4], blur_y[4];
+            const I there = first + lane_number < held;
+            for (int i = 0; i < 4; ++i) {{
+                const float middle = 4.0f * i + 1.5f;
+                across_u[i] = fma(u_x, (F)middle, u), down_u[i] = u_y * middle;
+                across_v[i] = fma(v_x, (F)middle, v), down_v[i] = v_y * middle;
+                across_w[i] = fma(w_x, (F)middle, w + turn), down_w[i] = w_y * middle;
+                in_x[i] = (abs_(x0 + middle - fields[{BOX}]) <= half_x) & there;
+                in_y[i] = abs_(y0 + middle - fields[{BOX + 1}]) <= half_y;
+                blur_x[i] = abs_(mx + middle) <= blur;
+                blur_y[i] = abs_(my + middle) <= blur;
+            }}
+            {{declare}}
+            for (int k = 0; k < 16; ++k) {{
+                const F cu = across_u[k & 3] + down_u[k >> 2], cv = across_v[k & 3] + down_v[k >> 2];
+                const F widest = across_w[k & 3] + down_w[k >> 2];
+                const F limit = fma(fields[{EXTENT}], widest, fields[{REACH}]);
+                const I low = in_x[k & 3] & in_y[k >> 2] & blur_x[k & 3] & blur_y[k >> 2];
+                const I disc = in_x[k & 3] & in_y[k >> 2] & (widest > zero) & (fma(cu, cu,
+                    cv * cv) <= limit * limit);
+                {{each}}
+            }}
+            {{end}}
         }}
-        const float* const r = record + g * {RECORD};
-        const float* const c = colour + g * channel_stride;
-{RECORD_FIELDS}
-        // Offsets from centre and mean of the first pixel of each block.
-        const float x0 = (float)tile_x + 0.5f, y0 = (float)tile_y + 0.5f;
-        const F ex = block_x + (x0 - r[{CENTER}]), ey = block_y + (y0 - r[{CENTER + 1}]);
-        const F mx = block_x + (x0 - r[{MEAN}]), my = block_y + (y0 - r[{MEAN + 1}]);
-        const F u_block = fma((F)u_x, ex, u_y * ey), v_block = fma((F)v_x, ex, v_y * ey);
-        const F w_block = fma((F)w_x, ex, fma((F)w_y, ey, one));
-
-        // Blocks it can reach: they touch the box; and the disc, of which U . e, V . e vary by no more than
-        // REACH
-        // within the block and W by no more than this; or the low-pass, a circle.
-        const float turn = 1.5f * ((w_x < 0.0f ? -w_x : w_x) + (w_y < 0.0f ? -w_y : w_y));
-        const F widest = w_block + (1.5f * (w_x + w_y) + turn);
-        const F cu = u_block + 1.5f * (u_x + u_y), cv = v_block + 1.5f * (v_x + v_y);
-        const F limit = r[{EXTENT}] * widest + r[{REACH}];
-        const float blur = r[{EXTENT}] * {LOG2_E**-0.5!r}f + 1.5f;
-        const I on_disc = (widest > zero) & (fma(cu, cu, cv * cv) <= limit * limit);
-        const I on_blur = (abs_(mx + 1.5f) <= blur) & (abs_(my + 1.5f) <= blur);
-        const I in_box = (abs_(block_x + (x0 + 1.5f - r[{BOX}])) <= r[{BOX + 2}] + 1.5f)
-            & (abs_(block_y + (y0 + 1.5f - r[{BOX + 1}])) <= r[{BOX + 3}] + 1.5f);
-        unsigned mask = bits(in_box & (on_disc | on_blur)) & alive;
-        if (!mask) continue;
-        unsigned blurred = mask & bits(on_blur);
-        mask &= ~blurred;
-        *(F*)ub = u_block;
-        *(F*)vb = v_block;
-        *(F*)wb = w_block;
-        *(F*)mxb = mx;
-        *(F*)myb = my;
-        const F u_lane = fma((F)u_x, column, u_y * row), v_lane = fma((F)v_x, column, v_y * row);
-        const F w_lane = fma((F)w_x, column, w_y * row);
 """
-"""CPU snippet: entry `at` -> its record, and bits of the blocks reached: by the low-pass or not (`mask`)."""
+"""CPU snippet: list from `at` on -> `held` entries in `rows`, u0 .. my0;
+{{each}} takes the masks of the 16 entries
+from `first` on of which the disc or the low-pass may reach block k, between {{declare}} and {{end}}."""
 
-BLOCK_ARRAYS = "".join(
-    f"    float {name}[16] __attribute__((aligned(64)));\n" for name in ("ub", "vb", "wb", "mxb", "myb")
-)
-
-IN_BLOCK = """
-            const F un = u_lane + ub[k], vn = v_lane + vb[k], wn = w_lane + wb[k];
-            const F dx = column + mxb[k], dy = row + myb[k];
+RAY = f"""
+            const float* const r = rows[i];
+            const float* const c = r + {CHANNELS};
+            const F un = fma((F)r[{U}], x, fma((F)r[{U + 1}], y, (F)u0[i]));
+            const F vn = fma((F)r[{V}], x, fma((F)r[{V + 1}], y, (F)v0[i]));
+            const F wn = fma((F)r[{SLOPE}], x, fma((F)r[{SLOPE + 1}], y, (F)w0[i]));
+            const float l = r[{LOG2_OPACITY}], depth = r[{DEPTH}];
 """
+BLUR = """
+            const F dx = x + mx0[i], dy = y + my0[i];
+"""
+"""CPU snippets: entry i of the batch, lanes x, y -> what HIT needs."""
+
+PIXEL_RAY = f"""
+        const size_t g = (size_t)ids.data[at];
+        const float* const r = records.data + g * {RECORD};
+        const float* const c = channels.data + g * channels.shape[1] + channel_offset;
+        const float ex = (float)x + 0.5f - r[{CENTER}], ey = (float)y + 0.5f - r[{CENTER + 1}];
+        const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
+        const float un = r[{U}] * ex + r[{U + 1}] * ey, vn = r[{V}] * ex + r[{V + 1}] * ey;
+        const float wn = 1.0f + r[{SLOPE}] * ex + r[{SLOPE + 1}] * ey;
+        const float l = r[{LOG2_OPACITY}], depth = r[{DEPTH}];
+"""
+"""Snippet for one pixel: entry `at` -> the same."""
 
 _HIT = """
             const F inverse = reciprocal(max_(wn, nearest));
@@ -183,7 +235,6 @@ HIT = f"""{_HIT}
 
 _WEIGH = """
             const F alpha = min_(raw, alpha_max);
-            const F t = T[k];
             const F next = fma(-alpha, t, t);
             const I blend = seen & (next > transmittance_min);
             const F w = blend ? alpha * t : zero;
@@ -195,32 +246,24 @@ WEIGH_DISC = f"""
 WEIGH = f"""
             const I seen = p >= cutoff;
 {_WEIGH}"""
-"""Snippets: raw alpha -> weight w of what blends, and depth z."""
+"""Snippets: raw alpha and transmittance t -> weight w of what blends, and depth z."""
 
-_ADD = """
-            c0[k] = fma(w, (F)r0, c0[k]);
-            c1[k] = fma(w, (F)r1, c1[k]);
-            c2[k] = fma(w, (F)r2, c2[k]);
-            if (geometry) {
-                n0[k] = fma(w, (F)nx, n0[k]);
-                n1[k] = fma(w, (F)ny, n1[k]);
-                n2[k] = fma(w, (F)nz, n2[k]);
-                bend[k] = fma(w, fma(z, one - t, -D[k]), bend[k]);
-                D[k] = fma(w, z, D[k]);
+_ADD = f"""
+            c0 = fma(w, (F)c[0], c0);
+            c1 = fma(w, (F)c[1], c1);
+            c2 = fma(w, (F)c[2], c2);
+            if (geometry) {{
+                n0 = fma(w, (F)r[{NORMAL}], n0);
+                n1 = fma(w, (F)r[{NORMAL + 1}], n1);
+                n2 = fma(w, (F)r[{NORMAL + 2}], n2);
+                bend = fma(w, fma(z, one - t, -D), bend);
+                D = fma(w, z, D);
                 const I middle = blend & (t > one_half);
-                median[k] = middle ? z : median[k];
-                median_at[k] = middle ? (I)at : median_at[k];
-            }
+                median = middle ? z : median;
+                median_at = middle ? (I)number : median_at;
+            }}
 """
-
-_SUMS = """
-    F c0[SIZE], c1[SIZE], c2[SIZE], n0[SIZE], n1[SIZE], n2[SIZE], D[SIZE], bend[SIZE], median[SIZE];
-    I median_at[SIZE];
-    for (int i = 0; i < SIZE; ++i) {
-        c0[i] = c1[i] = c2[i] = n0[i] = n1[i] = n2[i] = D[i] = bend[i] = median[i] = zero;
-        median_at[i] = (I)-1;
-    }
-"""
+"""Snippet: adds weight w of entry `number` of the list."""
 
 _WRITE = """
             // Over the background; an expected depth is divided by alpha.
@@ -241,29 +284,51 @@ _WRITE = """
 """
 """Snippet: `pixel`, t, the nine sums and at_median -> images."""
 
+_SUMS = ("c0", "c1", "c2", "D", "n0", "n1", "n2", "bend", "median")
+
+_BATCH = (
+    BATCH.replace("{declare}", "")
+    .replace("{each}", "entries[k] |= bits(low | disc) << first; blurred[k] |= bits(low) << first;")
+    .replace("{end}", "")
+)
+
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{VECTOR}{_SUMS}{BLOCK_ARRAYS}
-    const float* const record = records.data;
-    const float* const colour = channels.data + channel_offset;
-    const int channel_stride = channels.shape[1];
+{LOCATE_TILE}{VECTOR}{BATCH_STATE}
+    F {", ".join(f"{name}_[16]" for name in _SUMS)};
+    I median_at_[16];
+    for (int k = 0; k < 16; ++k) {{
+        {" = ".join(f"{name}_[k]" for name in _SUMS)} = zero;
+        median_at_[k] = (I)-1;
+    }}
     const int channels_out = image_out.shape[1];
-    const int* const id = ids.data;
     const int end = offsets.data[tile + 1];
     int at = begin;
-    for (; at < end && alive; ++at) {{
-{ENTRY}
-        while (mask) {{
-            const int k = __builtin_ctz(mask);
-            mask &= mask - 1;
-            const F un = u_lane + ub[k], vn = v_lane + vb[k], wn = w_lane + wb[k];
-{HIT_DISC}{EXP2}{WEIGH_DISC}{_ADD}{ADVANCE}
+    while (at < end && alive) {{
+        unsigned entries[16] = {{0}}, blurred[16] = {{0}};
+{_BATCH}
+        // Block after block, so that what it has blended stays in registers over the batch.
+        for (unsigned blocks = alive; blocks; blocks &= blocks - 1) {{
+            const int k = __builtin_ctz(blocks);
+            unsigned left = entries[k];
+            if (!left) continue;
+            const F x = X[k], y = Y[k];
+            F t = T[k], {", ".join(f"{name} = {name}_[k]" for name in _SUMS)};
+            I median_at = median_at_[k];
+            do {{
+                const int i = __builtin_ctz(left), number = at + i;
+                left &= left - 1;
+{RAY}
+                if (blurred[k] >> i & 1) {{
+{BLUR}{HIT}{EXP2}{WEIGH}{_ADD}{PASS}
+                }} else {{
+{HIT_DISC}{EXP2}{WEIGH_DISC}{_ADD}{PASS}
+                }}
+            }} while (left);
+            T[k] = t, {", ".join(f"{name}_[k] = {name}" for name in _SUMS)}, median_at_[k] = median_at;
+            if (!bits(t > 0.0f)) alive &= ~(1u << k);
         }}
-        while (blurred) {{
-            const int k = __builtin_ctz(blurred);
-            blurred &= blurred - 1;
-{IN_BLOCK}{HIT}{EXP2}{WEIGH}{_ADD}{ADVANCE}
-        }}
+        at += held;
     }}
     const float* const background = backgrounds.data + (size_t)camera * colours;
     for (int y = 0; y < y_end; ++y) {{
@@ -271,9 +336,8 @@ _TILE = f"""
             const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
             const float t = T[k][lane] < 0.0f ? -T[k][lane] : T[k][lane];
             const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
-            const float sum[9] = {{c0[k][lane], c1[k][lane], c2[k][lane], D[k][lane],
-                n0[k][lane], n1[k][lane], n2[k][lane], bend[k][lane], median[k][lane]}};
-            const int at_median = median_at[k][lane];
+            const float sum[9] = {{{", ".join(f"{name}_[k][lane]" for name in _SUMS)}}};
+            const int at_median = median_at_[k][lane];
 {_WRITE}
         }}
     }}
@@ -284,30 +348,25 @@ _TILE = f"""
 _PIXEL = f"""
 {LOCATE_PIXEL}
     if (!inside) return;
-{SCALAR}{_SUMS}
+{SCALAR}
+    F t = one, {", ".join(f"{name} = zero" for name in _SUMS)};
+    I median_at = -1;
     const int channels_out = image_out.shape[1];
     const int end = offsets.data[tile + 1];
     int last = begin;
     for (int at = begin; at < end; ++at) {{
-        const size_t g = (size_t)ids.data[at];
-        const float* const r = records.data + g * {RECORD};
-        const float* const c = channels.data + g * channels.shape[1] + channel_offset;
-{RECORD_FIELDS}
-        const float ex = (float)x + 0.5f - r[{CENTER}], ey = (float)y + 0.5f - r[{CENTER + 1}];
-        const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
-        const float un = u_x * ex + u_y * ey, vn = v_x * ex + v_y * ey, wn = 1.0f + w_x * ex + w_y * ey;
-{HIT}
+{PIXEL_RAY}{HIT}
         if (p < cutoff) continue;
 {EXP}{WEIGH}
         if (!blend) break;
+        const int number = at;
 {_ADD}
-        T[0] = next;
+        t = next;
         last = at + 1;
     }}
     const float* const background = backgrounds.data + (size_t)camera * colours;
-    const float t = T[0];
-    const float sum[9] = {{c0[0], c1[0], c2[0], D[0], n0[0], n1[0], n2[0], bend[0], median[0]}};
-    const int at_median = median_at[0];
+    const float sum[9] = {{{", ".join(_SUMS)}}};
+    const int at_median = median_at;
 {_WRITE}
     lasts_out.data[pixel] = last;
 """

@@ -9,32 +9,32 @@ the gradient at alpha_i is T_i q_i - R_i / (1 - alpha_i) with R_i as in
 `gdpro_sim.kernels.compositing_backward`: it starts as the sum of all w_j q_j, where those of the distortion
 add up to twice it, and loses w_i q_i at every surfel. The gradient at z_i is
 w_i (g_depth + 2 g_distortion B_i), and that of the median where i is the median. Sums over a tile's pixels
-go to the surfel's gradient, see `gdpro_sim.kernels.surfels_backward`; in place of EXTENT and BOX the sums
-over pixels of the absolute gradient at the mean.
+go to the surfel's gradient, see `gdpro_sim.kernels.surfels_backward`; in place of EXTENT and REACH the
+sums over pixels of the absolute gradient at the mean.
 """
 
 import warp as wp
 
-from gdpro_sim.kernels.compositing import ADVANCE, EXP2, LN2, LOCATE_PIXEL, LOCATE_TILE
+from gdpro_sim.kernels.compositing import BATCH_SIZE, EXP2, LN2, LOCATE_PIXEL, LOCATE_TILE, PASS
 from gdpro_sim.kernels.compositing_backward import SPILL, WARP_SUMS
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.kernels.slabs import IN_SLAB
 from gdpro_sim.kernels.surfel_compositing import (
-    BLOCK_ARRAYS,
-    ENTRY,
+    BATCH,
+    BATCH_STATE,
+    BLUR,
     EXP,
     HIT,
     HIT_DISC,
-    IN_BLOCK,
-    RECORD_FIELDS,
+    PIXEL_RAY,
+    RAY,
     SCALAR,
     VECTOR,
     WEIGH,
     WEIGH_DISC,
 )
 from gdpro_sim.kernels.surfels import (
-    BOX,
     CENTER,
     CHANNELS,
     DEPTH,
@@ -42,6 +42,7 @@ from gdpro_sim.kernels.surfels import (
     LOG2_OPACITY,
     MEAN,
     NORMAL,
+    REACH,
     RECORD,
     SLOPE,
     U,
@@ -57,7 +58,7 @@ wp.set_module_options(
     }
 )
 
-ABSOLUTE = (EXTENT, BOX)
+ABSOLUTE = (EXTENT, REACH)
 """Where the sums of absolute gradients at the mean's x and y go."""
 
 _STATE = """
@@ -100,10 +101,11 @@ _PIXEL_GRADIENT = """
 """Snippet: `pixel` -> gradients at its sums and `behind`, the first R."""
 
 _GRADIENT = f"""
-            F q = fma((F)r0, g0[k], fma((F)r1, g1[k], r2 * g2[k]));
+            F q = fma((F)c[0], g0[k], fma((F)c[1], g1[k], c[2] * g2[k]));
             F g_z = zero;
             if (geometry) {{
-                q = fma((F)nx, h0[k], fma((F)ny, h1[k], fma((F)nz, h2[k], q)));
+                q = fma((F)r[{NORMAL}], h0[k], fma((F)r[{NORMAL + 1}], h1[k], q));
+                q = fma((F)r[{NORMAL + 2}], h2[k], q);
                 g_z = g_depth[k];
                 q = fma(z, g_z, q);
                 if (with_distortion) {{
@@ -114,7 +116,7 @@ _GRADIENT = f"""
                     D[k] = now;
                 }}
                 g_z = w * g_z;
-                if (with_median) g_z += median_at[k] == (I)at ? g_median[k] : zero;
+                if (with_median) g_z += median_at[k] == (I)number ? g_median[k] : zero;
             }}
             const F behind = fma(-w, q, R[k]);
             R[k] = behind;
@@ -143,13 +145,12 @@ _ADD = """
             sum_u += g_u;
             sum_v += g_v;
             sum_w += g_w;
-            const F bx = (F)exb[k], by = (F)eyb[k];
-            sum_ux = fma(bx, g_u, sum_ux);
-            sum_uy = fma(by, g_u, sum_uy);
-            sum_vx = fma(bx, g_v, sum_vx);
-            sum_vy = fma(by, g_v, sum_vy);
-            sum_wx = fma(bx, g_w, sum_wx);
-            sum_wy = fma(by, g_w, sum_wy);
+            sum_ux = fma(at_x, g_u, sum_ux);
+            sum_uy = fma(at_y, g_u, sum_uy);
+            sum_vx = fma(at_x, g_v, sum_vx);
+            sum_vy = fma(at_y, g_v, sum_vy);
+            sum_wx = fma(at_x, g_w, sum_wx);
+            sum_wy = fma(at_y, g_w, sum_wy);
             sum_0 = fma(w, g0[k], sum_0);
             sum_1 = fma(w, g1[k], sum_1);
             sum_2 = fma(w, g2[k], sum_2);
@@ -160,11 +161,11 @@ _ADD = """
             }
 """
 
-_ABSOLUTE = """
-            if (absolute) {
-                abs_x += abs_(fma((F)u_x, g_u, fma((F)v_x, g_v, -w_x * g_w)) LOW_X);
-                abs_y += abs_(fma((F)u_y, g_u, fma((F)v_y, g_v, -w_y * g_w)) LOW_Y);
-            }
+_ABSOLUTE = f"""
+            if (absolute) {{
+                abs_x += abs_(fma((F)r[{U}], g_u, fma((F)r[{V}], g_v, -r[{SLOPE}] * g_w)) LOW_X);
+                abs_y += abs_(fma((F)r[{U + 1}], g_u, fma((F)r[{V + 1}], g_v, -r[{SLOPE + 1}] * g_w)) LOW_Y);
+            }}
 """
 
 _ADD_DISC = _ADD + _ABSOLUTE.replace(" LOW_X", "").replace(" LOW_Y", "")
@@ -177,10 +178,32 @@ _ADD_BLUR = (
     + _ABSOLUTE.replace("LOW_X", "+ dx * g_low").replace("LOW_Y", "+ dy * g_low")
 )
 
+_ZERO = """
+            F sum_p = zero, sum_z = zero, sum_u = zero, sum_v = zero, sum_w = zero, sum_lx = zero,
+                sum_ly = zero;
+            F sum_ux = zero, sum_uy = zero, sum_vx = zero, sum_vy = zero, sum_wx = zero, sum_wy = zero;
+            F sum_0 = zero, sum_1 = zero, sum_2 = zero, sum_n0 = zero, sum_n1 = zero, sum_n2 = zero;
+            F abs_x = zero, abs_y = zero;
+"""
+
+_BATCH = (
+    BATCH.replace("{declare}", "I reached = (I)0, softened = (I)0;")
+    .replace("{each}", "reached |= (low | disc) & (1 << k); softened |= low & (1 << k);")
+    .replace(
+        "{end}",
+        f"""*(I*)(masks + first) = reached;
+            *(I*)(blurs + first) = softened;
+            for (int j = 0; j < 16 && first + j < held; ++j) {{
+                const float* const sum = sums_out.data + (size_t)id[at + first + j] * {RECORD};
+                __builtin_prefetch(sum, 1);
+                __builtin_prefetch(sum + 16, 1);
+            }}""",
+    )
+)
+
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{VECTOR}{SUM_LANES}{IN_SLAB}{BLOCK_ARRAYS}
-    float exb[16] __attribute__((aligned(64))), eyb[16] __attribute__((aligned(64)));
+{LOCATE_TILE}{VECTOR}{SUM_LANES}{IN_SLAB}{BATCH_STATE}
     const int channels_out = image.shape[1];
 {_STATE}
     for (int y = 0; y < y_end; ++y) {{
@@ -210,63 +233,67 @@ _TILE = f"""
 
     const bool whole = slab_begin == 0 && slab_end == offsets.shape[0] - 1;
     int spill = whole ? 0 : spill_begins.data[tile];
-    const float* const record = records.data;
-    const float* const colour = channels.data + channel_offset;
-    const int channel_stride = channels.shape[1];
-    const int* const id = ids.data;
     const int end = stops.data[tile];
     const int WIDTH = {RECORD};
-    for (int at = begin; at < end; ++at) {{
-{ENTRY}
-        *(F*)exb = ex;
-        *(F*)eyb = ey;
-        F sum_p = zero, sum_z = zero, sum_u = zero, sum_v = zero, sum_w = zero, sum_lx = zero, sum_ly = zero;
-        F sum_ux = zero, sum_uy = zero, sum_vx = zero, sum_vy = zero, sum_wx = zero, sum_wy = zero;
-        F sum_0 = zero, sum_1 = zero, sum_2 = zero, sum_n0 = zero, sum_n1 = zero, sum_n2 = zero;
-        F abs_x = zero, abs_y = zero;
-        while (mask) {{
-            const int k = __builtin_ctz(mask);
-            mask &= mask - 1;
-            const F un = u_lane + ub[k], vn = v_lane + vb[k], wn = w_lane + wb[k];
-{HIT_DISC}{EXP2}{WEIGH_DISC}{_GRADIENT}{_CHAIN}{_ADD_DISC}{ADVANCE}
-        }}
-        while (blurred) {{
-            const int k = __builtin_ctz(blurred);
-            blurred &= blurred - 1;
-{IN_BLOCK}{HIT}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}{ADVANCE}
-        }}
+    for (int at = begin; at < end;) {{
+        int masks[{BATCH_SIZE}] __attribute__((aligned(64))),
+            blurs[{BATCH_SIZE}] __attribute__((aligned(64)));
+{_BATCH}
+        for (int i = 0; i < held; ++i) {{
+            const int number = at + i;
+            unsigned mask = (unsigned)masks[i] & alive;
+            if (!mask) continue;
+            unsigned blurred = mask & (unsigned)blurs[i];
+            mask &= ~blurred;
+            const size_t g = (size_t)id[number];
+{_ZERO}
+            while (mask) {{
+                const int k = __builtin_ctz(mask);
+                mask &= mask - 1;
+                const F x = X[k], y = Y[k], at_x = x, at_y = y;
+                F t = T[k];
+{RAY}{HIT_DISC}{EXP2}{WEIGH_DISC}{_GRADIENT}{_CHAIN}{_ADD_DISC}{PASS}
+                T[k] = t;
+                if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
+            }}
+            while (blurred) {{
+                const int k = __builtin_ctz(blurred);
+                blurred &= blurred - 1;
+                const F x = X[k], y = Y[k], at_x = x, at_y = y;
+                F t = T[k];
+{RAY}{BLUR}{HIT}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}{PASS}
+                T[k] = t;
+                if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
+            }}
 {SPILL}
-        // e is block offset plus lane offset.
-        const F center_x = fma((F)u_x, sum_u, fma((F)v_x, sum_v, -w_x * sum_w));
-        const F center_y = fma((F)u_y, sum_u, fma((F)v_y, sum_v, -w_y * sum_w));
-        const F sums[16] = {{
-            center_x + sum_lx, center_y + sum_ly, center_x, center_y,
-            -fma(column, sum_u, sum_ux), -fma(row, sum_u, sum_uy),
-            -fma(column, sum_v, sum_vx), -fma(row, sum_v, sum_vy),
-            fma(column, sum_w, sum_wx), fma(row, sum_w, sum_wy),
-            one_half * sum_p, abs_x, sum_0, sum_1, sum_2, sum_z,
-        }};
-        F total;
-        __builtin_memcpy(&total, out, 64);
-        total += sum_lanes(sums);
-        __builtin_memcpy(out, &total, 64);
-        if (geometry || absolute) {{
-            const F c0 = MERGE_2(sum_n0, sum_n2), c1 = MERGE_2(sum_n1, abs_y), c = MERGE_1(c0, c1);
-            const F c4 = MERGE_4(c, c), c8 = MERGE_8(c4, c4);
-            for (int i = 0; i < 4; ++i) out[16 + i] += c8[i];
+            // Offsets e from the centre are X, Y plus those of the tile.
+            const float* const r = rows[i];
+            const F ex = (F)((float)tile_x + 0.5f - r[{CENTER}]),
+                ey = (F)((float)tile_y + 0.5f - r[{CENTER + 1}]);
+            const F center_x = fma((F)r[{U}], sum_u, fma((F)r[{V}], sum_v, -r[{SLOPE}] * sum_w));
+            const F center_y = fma((F)r[{U + 1}], sum_u, fma((F)r[{V + 1}], sum_v, -r[{SLOPE + 1}] * sum_w));
+            const F sums[16] = {{
+                center_x + sum_lx, center_y + sum_ly, center_x, center_y,
+                -fma(ex, sum_u, sum_ux), -fma(ey, sum_u, sum_uy), -fma(ex, sum_v, sum_vx),
+                    -fma(ey, sum_v, sum_vy),
+                fma(ex, sum_w, sum_wx), fma(ey, sum_w, sum_wy), abs_x, abs_y, zero, zero, zero, zero,
+            }};
+            F total;
+            __builtin_memcpy(&total, out, 64);
+            total += sum_lanes(sums);
+            __builtin_memcpy(out, &total, 64);
+            const F b0 = MERGE_4(one_half * sum_p, sum_n2), b1 = MERGE_4(sum_z, sum_0);
+            const F b2 = MERGE_4(sum_n0, sum_1), b3 = MERGE_4(sum_n1, sum_2);
+            const F c0 = MERGE_2(b0, b2), c1 = MERGE_2(b1, b3), b = MERGE_1(c0, c1), later = MERGE_8(b, b);
+            for (int j = 0; j < 8; ++j) out[16 + j] += later[j];
         }}
+        at += held;
     }}
 #endif
 """
 
-assert (MEAN, CENTER, U, V, SLOPE, LOG2_OPACITY, ABSOLUTE[0], CHANNELS, DEPTH, NORMAL, ABSOLUTE[1]) == (
-    *range(0, 12, 2),
-    11,
-    12,
-    15,
-    16,
-    19,
-), "the tile kernel writes its sums in this order"
+assert (MEAN, CENTER, U, V, SLOPE, *ABSOLUTE) == (0, 2, 4, 6, 8, 10, 11)
+assert (LOG2_OPACITY, DEPTH, NORMAL, CHANNELS) == (16, 17, 18, 21), "the order of the sums above"
 
 
 @wp.func_native(_TILE)
@@ -401,29 +428,20 @@ _PIXEL = f"""
     }}
     const int last = inside ? stops.data[pixel] : begin;
     const int end = warp_max(last);
+    F t = one;
     for (int at = begin; at < end; ++at) {{
-        const size_t g = (size_t)ids.data[at];
-        const float* const r = records.data + g * {RECORD};
-        const float* const c = channels.data + g * channels.shape[1] + channel_offset;
-{RECORD_FIELDS}
-        const float ex = (float)x + 0.5f - r[{CENTER}], ey = (float)y + 0.5f - r[{CENTER + 1}];
-        const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
-        const float un = u_x * ex + u_y * ey, vn = v_x * ex + v_y * ey, wn = 1.0f + w_x * ex + w_y * ey;
-{HIT}
+{PIXEL_RAY}{HIT}
         const bool blends = at < last && p >= cutoff;
         if (!warp_any(blends)) continue;
-        float sum_p = 0.0f, sum_z = 0.0f, sum_u = 0.0f, sum_v = 0.0f, sum_w = 0.0f, sum_lx = 0.0f,
-            sum_ly = 0.0f;
-        float sum_ux = 0.0f, sum_uy = 0.0f, sum_vx = 0.0f, sum_vy = 0.0f, sum_wx = 0.0f, sum_wy = 0.0f;
-        float sum_0 = 0.0f, sum_1 = 0.0f, sum_2 = 0.0f, sum_n0 = 0.0f, sum_n1 = 0.0f, sum_n2 = 0.0f;
-        float abs_x = 0.0f, abs_y = 0.0f;
+{_ZERO}
         if (blends) {{
-            const float exb[1] = {{ex}}, eyb[1] = {{ey}};
+            const int number = at;
+            const float at_x = ex, at_y = ey;
 {EXP}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}
-            T[0] = next;
+            t = next;
         }}
-        const float center_x = u_x * sum_u + v_x * sum_v - w_x * sum_w;
-        const float center_y = u_y * sum_u + v_y * sum_v - w_y * sum_w;
+        const float center_x = r[{U}] * sum_u + r[{V}] * sum_v - r[{SLOPE}] * sum_w;
+        const float center_y = r[{U + 1}] * sum_u + r[{V + 1}] * sum_v - r[{SLOPE + 1}] * sum_w;
         float* const out = sums_out.data + g * {RECORD};
         warp_add(out + {MEAN}, center_x + sum_lx);
         warp_add(out + {MEAN + 1}, center_y + sum_ly);

@@ -15,16 +15,17 @@ thinner than a pixel. Every surfel seen by a camera becomes one record of 24 flo
                      reaches behind the camera, CENTER
     CENTER        2  projected centre in pixels
     U, V, SLOPE   6  1/pixel
-    LOG2_OPACITY  1  base-2 logarithm of the opacity
     EXTENT        1  sqrt(u^2 + v^2) where alpha = 1/255
-    CHANNELS      3  the first three channels to blend
+    REACH         1  the longest (U . e, V . e) from a 4 x 4 block's centre to its corners
+    BOX           4  centre and half extents in pixels of the box outside which alpha < 1/255
+    LOG2_OPACITY  1  base-2 logarithm of the opacity
     DEPTH         1  camera-space z of the centre in metres
     NORMAL        3  world-space unit normal, facing the camera
-    BOX           4  centre and half extents in pixels of the box outside which alpha < 1/255
-    REACH         1  the longest (U . e, V . e) from a 4 x 4 block's centre to its corners
+    CHANNELS      3  the first three channels to blend
 
-Culled surfels have a record of zeros, an empty rectangle and an infinite sort key. The index of the kernel
-is a group of `LANES` surfels of one camera (see `gdpro_sim.kernels.lanes`), camera after camera.
+The first 16 tell which pixels it can reach. Culled surfels have a record of zeros, an empty rectangle and an
+infinite sort key. The index of the kernel is a group of `LANES` surfels of one camera (see
+`gdpro_sim.kernels.lanes`), camera after camera.
 """
 
 import warp as wp
@@ -32,13 +33,14 @@ import warp as wp
 from gdpro_sim.kernels.harmonics import HARMONICS
 from gdpro_sim.kernels.lanes import CPU_FLAGS, PRELUDE
 from gdpro_sim.kernels.projection import (
+    BIN,
     CAMERA,
     LOG2_CUTOFF,
     PINHOLE,
+    PIXEL_BOX,
     ROTATION,
     SLACK,
     SQRT_HALF_LOG2_E,
-    TILE,
     vec4s,
 )
 
@@ -57,13 +59,13 @@ CENTER = 2
 U = 4
 V = 6
 SLOPE = 8
-LOG2_OPACITY = 10
-EXTENT = 11
-CHANNELS = 12
-DEPTH = 15
-NORMAL = 16
-BOX = 19
-REACH = 23
+EXTENT = 10
+REACH = 11
+BOX = 12
+LOG2_OPACITY = 16
+DEPTH = 17
+NORMAL = 18
+CHANNELS = 21
 
 LOG2_E = 1.4426950408889634
 
@@ -129,9 +131,7 @@ _PROJECT = f"""
     const F extent = sqrt_(max_(extent2, zero));
 
     // Box around the image of the disc's part above the cutoff, where it is before the camera: the outermost
-    // x of
-    // the circle of radius r standard deviations solve (x z)^2 = r^2 ((ia - x az)^2 s0^2 + (ib - x bz)^2
-    // s1^2).
+    // x of the circle of r standard deviations solve (x z)^2 = r^2 ((ia - x az)^2 s0^2 + (ib - x bz)^2 s1^2).
     const F r2 = extent2 * {float(SQRT_HALF_LOG2_E) ** -2!r}f;
     const F front = z * z - r2 * behind;
     const I bounded = front > 0.01f * z * z;
@@ -150,12 +150,7 @@ _PROJECT = f"""
     const F box_y = select(bounded, (high_y - low_y) * slack + 1.0e-6f * abs_(center_y),
         splat((float)height));
 
-    // Pixels whose centre lies in the box, then the tiles they lie in (end exclusive).
-    const F x0 = max_(ceil_(mean_x - box_x - 0.5f), zero);
-    const F y0 = max_(ceil_(mean_y - box_y - 0.5f), zero);
-    const F x1 = min_(floor_(mean_x + box_x - 0.5f), splat((float)(width - 1)));
-    const F y1 = min_(floor_(mean_y + box_y - 0.5f), splat((float)(height - 1)));
-    // A sum of magnitudes is finite only where all its terms are.
+{PIXEL_BOX}    // A sum of magnitudes is finite only where all its terms are.
     const F size = abs_(u_x) + abs_(u_y) + abs_(v_x) + abs_(v_y) + abs_(w_x) + abs_(w_y) + abs_(s0) + abs_(s1)
         + abs_(opacity) + box_x + box_y + z * 1.0e16f;
     const F far_out = abs_(center_x) + abs_(center_y) + abs_(shift_x) + abs_(shift_y);
@@ -211,29 +206,7 @@ _PROJECT = f"""
     for (int i = 0; i < 16; ++i) later[i] = fields[{RECORD - 16} + i];
     store_rows(record, {RECORD}, fields);
     store_rows(record + {RECORD - 16}, {RECORD}, later);
-    const F largest = splat(1.0e9f);
-    const I radius_x = to_int(select(drawn, min_(ceil_(box_x), largest), zero));
-    const I radius_y = to_int(select(drawn, min_(ceil_(box_y), largest), zero));
-    const F tile = splat({1 / TILE!r}f);
-    const I begin_x = to_int(select(drawn, x0 * tile, zero)),
-        begin_y = to_int(select(drawn, y0 * tile, zero));
-    const I end_x = to_int(select(drawn, x1 * tile + 1.0f, zero));
-    const I end_y = to_int(select(drawn, y1 * tile + 1.0f, zero));
-    const F key = select(drawn, z, splat(1.0f / 0.0f));
-    store(keys_out.data + (size_t)camera * keys_out.shape[1] + n, 1, key);
-    int* const radius = (int*)(radii_out.data + first);
-    short* const rect = (short*)(rects_out.data + first);
-    int* const order = order_out.data + (size_t)camera * order_out.shape[1] + n;
-    for (int j = 0; j < lanes; ++j) {{
-        radius[2 * j] = lane_int(radius_x, j);
-        radius[2 * j + 1] = lane_int(radius_y, j);
-        rect[4 * j] = (short)lane_int(begin_x, j);
-        rect[4 * j + 1] = (short)lane_int(begin_y, j);
-        rect[4 * j + 2] = (short)lane_int(end_x, j);
-        rect[4 * j + 3] = (short)lane_int(end_y, j);
-        order[j] = (int)first + j;
-    }}
-"""
+{BIN}"""
 
 
 @wp.func_native(_PROJECT)

@@ -202,8 +202,6 @@ class _Blend(torch.autograd.Function):
         if given[2] is None:
             rest[1] = image.new_empty((0, 3))
         blending: SurfelBlending = ctx.blending
-        if len(records) == 0 or len(image) == 0:
-            return torch.zeros_like(records), torch.zeros_like(means2d), None, None, None, None, None
         geometry = blending.depth or any(gradient is not None for gradient in given[2:])
         with torch_stream(records):
             sums = gradient_sums(
@@ -221,7 +219,10 @@ class _Blend(torch.autograd.Function):
         g_backgrounds = None
         if ctx.needs_input_grad[3]:
             with serial_torch():
-                covered = images[1].view(ctx.cameras, -1, 1) * g_image.view(ctx.cameras, -1, image.shape[1])
+                pixels = len(image) // max(1, ctx.cameras)
+                covered = images[1].view(ctx.cameras, pixels, 1) * g_image.view(
+                    ctx.cameras, pixels, image.shape[1]
+                )
                 g_backgrounds = covered[..., : blending.colours].double().sum(1).float()
         return sums, g_means2d, g_channels, g_backgrounds, None, None, None
 
@@ -242,6 +243,8 @@ def gradient_sums(
     images:    image, transmittance, depths, normals, distortion and list positions of medians
     gradients: of image, alphas, normals, distortion and medians; empty ones are zero
     """
+    if len(records) == 0 or len(images[0]) == 0:
+        return torch.zeros_like(records)
     view = blending.view
     inputs = [
         *_sources(records, channels, lists),
@@ -288,8 +291,6 @@ def weigh_surfels(
     """[M, D] sums over pixels of blending weight times `values` [C H W, D], D <= 3; without gradients."""
     records = projection.records
     count = values.shape[1]
-    if len(records) == 0 or len(values) == 0:
-        return values.new_zeros((len(records), count))
     nothing = values.new_empty(0)
     none = values.new_empty((0, 3))
     images = [

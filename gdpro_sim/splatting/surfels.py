@@ -9,6 +9,7 @@ import torch
 from gdpro_sim.device import torch_stream
 from gdpro_sim.splatting.checks import (
     check_choice,
+    check_colors,
     check_count,
     check_gsplat_arguments,
     check_number,
@@ -17,7 +18,7 @@ from gdpro_sim.splatting.checks import (
 )
 from gdpro_sim.splatting.depth import depth_to_normals
 from gdpro_sim.splatting.projection import View
-from gdpro_sim.splatting.rasterization import RENDER_MODES, RasterOptions, _check_colors
+from gdpro_sim.splatting.rasterization import RENDER_MODES, RasterOptions
 from gdpro_sim.splatting.surfel_compositing import SurfelBlending, composite_surfels, weigh_surfels
 from gdpro_sim.splatting.surfel_projection import SurfelProjection, project_surfels
 from gdpro_sim.splatting.tiles import TileLists, count_and_fill, empty_lists, expand_and_sort
@@ -118,7 +119,7 @@ def rasterization_2dgs(
     with_colors = render_mode.startswith("RGB")
     with_depth = render_mode != "RGB"
     divided = render_mode.endswith("ED")
-    colors = _check_colors(colors, sh_degree, cameras, count, means)
+    colors = check_colors(colors, sh_degree, cameras, count, means)
     given = 3 if sh_degree is not None else colors.shape[-1]
     features = given if with_colors else 0
     background = means.new_zeros((cameras, features))
