@@ -255,3 +255,15 @@ def test_a_thousand_in_one_place(kind: str) -> None:
     outputs, _, gradients = run(kind, inputs, render_mode="RGB+ED")
     assert_finite(outputs, gradients)
     assert (gradients["colors"][:2].abs().sum(-1) > 0).all()
+
+
+@pytest.mark.parametrize("length", [1e-45, 1e-42, 1e-38, 1e-30, 1e-15, 1e15, 1e30, 1e38])
+@pytest.mark.parametrize("kind", KINDS)
+def test_quaternions_of_extreme_length(kind: str, length: float) -> None:
+    """The gradient goes as the inverse of the length, which float32 cannot hold for the shortest."""
+    inputs = {**cloud(20, 6), "colors": features(20, 3, 6), **cameras(2, 30, 30)}
+    inputs["quats"] = (inputs["quats"] / inputs["quats"].norm(dim=-1, keepdim=True)).double() * length
+    inputs["quats"] = inputs["quats"].float()
+    outputs, meta, gradients = run(kind, inputs, render_mode="RGB+ED")
+    assert_finite(outputs, gradients)
+    assert_none_where_not_drawn(meta, gradients)
