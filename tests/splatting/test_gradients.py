@@ -182,11 +182,13 @@ def test_skewed_pixels_planes_and_blur() -> None:
     assert_small(worst(inputs, "RGB+D", near_plane=2.5, far_plane=3.4, eps2d=0.7))
 
 
-def test_long_lists() -> None:
-    """Many faint layers: hundreds of Gaussians in a pixel."""
+@pytest.mark.parametrize("method", ["tile", "pixel"])
+@pytest.mark.parametrize("opacity", [(0.02, 0.05), (0.1, 0.3), (0.3, 0.7)], ids=["faint", "medium", "dense"])
+def test_long_lists(opacity: tuple[float, float], method: str) -> None:
+    """Hundreds of Gaussians in a pixel: blending to the last of them, or stopping somewhere on the way."""
     inputs = inputs_of(600, 41, views=1, size=0.3, width=20, height=18)
-    inputs["opacities"] = 0.02 + 0.05 * inputs["opacities"]
-    assert_small(worst(inputs, "RGB+ED", (20, 18), least=0.3))
+    inputs["opacities"] = opacity[0] + opacity[1] * inputs["opacities"]
+    assert_small(worst(inputs, "RGB+ED", (20, 18), least=0.3, method=method))
 
 
 @settings(max_examples=40, deadline=None)

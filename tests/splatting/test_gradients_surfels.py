@@ -219,10 +219,13 @@ def test_skewed_pixels_and_planes() -> None:
     assert_small(worst(inputs, "RGB+D", near_plane=2.5, far_plane=3.4))
 
 
-def test_long_lists() -> None:
-    inputs = inputs_of(500, 41, views=1, size=0.3, width=20, height=18)
-    inputs["opacities"] = 0.02 + 0.05 * inputs["opacities"]
-    assert_small(worst(inputs, "RGB+ED", (20, 18), least=0.1))
+@pytest.mark.parametrize("method", ["tile", "pixel"])
+@pytest.mark.parametrize("opacity", [(0.02, 0.05), (0.1, 0.3), (0.3, 0.7)], ids=["faint", "medium", "dense"])
+def test_long_lists(opacity: tuple[float, float], method: str) -> None:
+    """Hundreds of Gaussians in a pixel: blending to the last of them, or stopping somewhere on the way."""
+    inputs = inputs_of(600, 41, views=1, size=0.3, width=20, height=18)
+    inputs["opacities"] = opacity[0] + opacity[1] * inputs["opacities"]
+    assert_small(worst(inputs, "RGB+ED", (20, 18), least=0.1, method=method))
 
 
 @pytest.mark.parametrize("cosine", [0.3, 0.03, 0.003])
