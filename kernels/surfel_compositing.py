@@ -29,8 +29,10 @@ from gdpro_sim.kernels.compositing import (
     TRANSMITTANCE_MIN,
 )
 from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
-from gdpro_sim.kernels.projection import LOG2_CUTOFF
+from gdpro_sim.kernels.projection import LOG2_CUTOFF, SLACK
+from gdpro_sim.kernels.surfel_images import IMAGES
 from gdpro_sim.kernels.surfels import (
+    BLUR,
     BOX,
     CENTER,
     CHANNELS,
@@ -40,7 +42,6 @@ from gdpro_sim.kernels.surfels import (
     LOG2_OPACITY,
     MEAN,
     NORMAL,
-    REACH,
     RECORD,
     SLOPE,
     U,
@@ -121,7 +122,7 @@ BATCH_STATE = f"""
 BATCH = f"""
         // The next entries of the list, copied to `rows`, 16 at a time side by side in lanes: U . e, V . e, W
         // and the offset from the mean at the tile's first pixel, and the blocks each can reach. Those touch
-        // its box, and its low-pass, a circle, or its disc: within a block (U . e, V . e) varies by REACH and
+        // its box, and its low-pass or its disc: within a block (U . e, V . e) varies by `reach` and
         // W by `turn` at most.
         const int held = end - at < {BATCH_SIZE} ? end - at : {BATCH_SIZE};
         for (int first = 0; first < held; first += 16) {{
@@ -155,7 +156,10 @@ BATCH = f"""
             *(F*)(mx0 + first) = mx;
             *(F*)(my0 + first) = my;
             const F turn = 1.5f * (abs_(w_x) + abs_(w_y));
-            const F blur = fields[{EXTENT}] * {LOG2_E**-0.5!r}f + 1.5f;
+            const F blur = fields[{BLUR}] + 1.5f;
+            const F corner_u = u_x + u_y, corner_v = v_x + v_y, other_u = u_x - u_y, other_v = v_x - v_y;
+            const F reach = {1.5 * float(SLACK)!r}f * __builtin_elementwise_sqrt(max_(
+                fma(corner_u, corner_u, corner_v * corner_v), fma(other_u, other_u, other_v * other_v)));
             const F half_x = fields[{BOX + 2}] + 1.5f, half_y = fields[{BOX + 3}] + 1.5f;
             F across_u[4], across_v[4], across_w[4], down_u[4], down_v[4], down_w[4];
             I in_x[4], in_y[4], blur_x[4], blur_y[4];
@@ -174,7 +178,7 @@ BATCH = f"""
             for (int k = 0; k < 16; ++k) {{
                 const F cu = across_u[k & 3] + down_u[k >> 2], cv = across_v[k & 3] + down_v[k >> 2];
                 const F widest = across_w[k & 3] + down_w[k >> 2];
-                const F limit = fma(fields[{EXTENT}], widest, fields[{REACH}]);
+                const F limit = fma(fields[{EXTENT}], widest, reach);
                 const I low = in_x[k & 3] & in_y[k >> 2] & blur_x[k & 3] & blur_y[k >> 2];
                 const I disc = in_x[k & 3] & in_y[k >> 2] & (widest > zero) & (fma(cu, cu,
                     cv * cv) <= limit * limit);
@@ -195,7 +199,7 @@ RAY = f"""
             const F wn = fma((F)r[{SLOPE}], x, fma((F)r[{SLOPE + 1}], y, (F)w0[i]));
             const float l = r[{LOG2_OPACITY}], depth = r[{DEPTH}];
 """
-BLUR = """
+LOW = """
             const F dx = x + mx0[i], dy = y + my0[i];
 """
 """CPU snippets: entry i of the batch, lanes x, y -> what HIT needs."""
@@ -292,9 +296,26 @@ _BATCH = (
     .replace("{end}", "")
 )
 
+_FETCH = """
+    // What is written at the end is on its way to the cache meanwhile.
+    for (int y = 0; y < y_end; ++y) {
+        const size_t row = origin + (size_t)y * width;
+        __builtin_prefetch(alphas_out.data + row, 1);
+        __builtin_prefetch(transmittance_out.data + row, 1);
+        for (int i = 0; i < channels_out; ++i) __builtin_prefetch(image_out.data + row * channels_out
+            + 16 * i, 1);
+        if (!geometry) continue;
+        __builtin_prefetch(depths_out.data + row, 1);
+        __builtin_prefetch(distortion_out.data + row, 1);
+        __builtin_prefetch(medians_out.data + row, 1);
+        __builtin_prefetch(medians_at_out.data + row, 1);
+        for (int i = 0; i < 3; ++i) __builtin_prefetch(normals_out.data + row * 3 + 16 * i, 1);
+    }
+"""
+
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{VECTOR}{BATCH_STATE}
+{LOCATE_TILE}{VECTOR}{IMAGES}{BATCH_STATE}
     F {", ".join(f"{name}_[16]" for name in _SUMS)};
     I median_at_[16];
     for (int k = 0; k < 16; ++k) {{
@@ -302,6 +323,7 @@ _TILE = f"""
         median_at_[k] = (I)-1;
     }}
     const int channels_out = image_out.shape[1];
+{_FETCH}
     const int end = offsets.data[tile + 1];
     int at = begin;
     while (at < end && alive) {{
@@ -320,7 +342,7 @@ _TILE = f"""
                 left &= left - 1;
 {RAY}
                 if (blurred[k] >> i & 1) {{
-{BLUR}{HIT}{EXP2}{WEIGH}{_ADD}{PASS}
+{LOW}{HIT}{EXP2}{WEIGH}{_ADD}{PASS}
                 }} else {{
 {HIT_DISC}{EXP2}{WEIGH_DISC}{_ADD}{PASS}
                 }}
@@ -330,17 +352,37 @@ _TILE = f"""
         }}
         at += held;
     }}
+
+    // Over the background; an expected depth is divided by alpha.
     const float* const background = backgrounds.data + (size_t)camera * colours;
-    for (int y = 0; y < y_end; ++y) {{
-        for (int x = 0; x < x_end; ++x) {{
-            const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
-            const float t = T[k][lane] < 0.0f ? -T[k][lane] : T[k][lane];
-            const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
-            const float sum[9] = {{{", ".join(f"{name}_[k][lane]" for name in _SUMS)}}};
-            const int at_median = median_at_[k][lane];
-{_WRITE}
-        }}
+    F A_[16];
+    F* const sums[4] = {{c0_, c1_, c2_, D_}};
+    for (int k = 0; k < 16; ++k) {{
+        T[k] = abs_(T[k]);
+        A_[k] = one - T[k];
+        for (int i = 0; i < colours; ++i) sums[i][k] = fma(T[k], (F)background[i], sums[i][k]);
     }}
+    const F* const alphas[1] = {{A_}};
+    const F* const transmittances[1] = {{T}};
+    const F* const depths[1] = {{D_}};
+    write_image(alphas_out.data, 1, alphas);
+    write_image(transmittance_out.data, 1, transmittances);
+    if (geometry) {{
+        for (int k = 0; k < 16; ++k) bend_[k] = bend_[k] + bend_[k];
+        const F* const normals[3] = {{n0_, n1_, n2_}};
+        const F* const distortions[1] = {{bend_}};
+        const F* const medians[1] = {{median_}};
+        const F* const medians_at[1] = {{(const F*)median_at_}};
+        write_image(depths_out.data, 1, depths);
+        write_image(normals_out.data, 3, normals);
+        write_image(distortion_out.data, 1, distortions);
+        write_image(medians_out.data, 1, medians);
+        write_image((float*)medians_at_out.data, 1, medians_at);
+    }}
+    if (divided) for (int k = 0; k < 16; ++k) D_[k] = D_[k] / max_(A_[k], (F)1e-10f);
+    const F* planes[4];
+    for (int i = 0; i < channels_out; ++i) planes[i] = i < colours ? sums[i] : D_;
+    write_image(image_out.data, channels_out, planes);
     stops_out.data[tile] = at;
 #endif
 """

@@ -9,7 +9,7 @@ the gradient at alpha_i is T_i q_i - R_i / (1 - alpha_i) with R_i as in
 `gdpro_sim.kernels.compositing_backward`: it starts as the sum of all w_j q_j, where those of the distortion
 add up to twice it, and loses w_i q_i at every surfel. The gradient at z_i is
 w_i (g_depth + 2 g_distortion B_i), and that of the median where i is the median. Sums over a tile's pixels
-go to the surfel's gradient, see `gdpro_sim.kernels.surfels_backward`; in place of EXTENT and REACH the
+go to the surfel's gradient, see `gdpro_sim.kernels.surfels_backward`; in place of EXTENT and BLUR the
 sums over pixels of the absolute gradient at the mean.
 """
 
@@ -23,10 +23,10 @@ from gdpro_sim.kernels.slabs import IN_SLAB
 from gdpro_sim.kernels.surfel_compositing import (
     BATCH,
     BATCH_STATE,
-    BLUR,
     EXP,
     HIT,
     HIT_DISC,
+    LOW,
     PIXEL_RAY,
     RAY,
     SCALAR,
@@ -34,7 +34,9 @@ from gdpro_sim.kernels.surfel_compositing import (
     WEIGH,
     WEIGH_DISC,
 )
+from gdpro_sim.kernels.surfel_images import IMAGES
 from gdpro_sim.kernels.surfels import (
+    BLUR,
     CENTER,
     CHANNELS,
     DEPTH,
@@ -42,7 +44,6 @@ from gdpro_sim.kernels.surfels import (
     LOG2_OPACITY,
     MEAN,
     NORMAL,
-    REACH,
     RECORD,
     SLOPE,
     U,
@@ -58,7 +59,7 @@ wp.set_module_options(
     }
 )
 
-ABSOLUTE = (EXTENT, REACH)
+ABSOLUTE = (EXTENT, BLUR)
 """Where the sums of absolute gradients at the mean's x and y go."""
 
 _STATE = """
@@ -203,31 +204,60 @@ _BATCH = (
 
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{VECTOR}{SUM_LANES}{IN_SLAB}{BATCH_STATE}
+{LOCATE_TILE}{VECTOR}{IMAGES}{SUM_LANES}{IN_SLAB}{BATCH_STATE}
     const int channels_out = image.shape[1];
 {_STATE}
-    for (int y = 0; y < y_end; ++y) {{
-        for (int x = 0; x < x_end; ++x) {{
-            const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
-            const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
-{_PIXEL_GRADIENT}
-            R[k][lane] = behind;
-            g0[k][lane] = gradient[0];
-            g1[k][lane] = gradient[1];
-            g2[k][lane] = gradient[2];
-            g_depth[k][lane] = gradient[3];
-            h0[k][lane] = normal[0];
-            h1[k][lane] = normal[1];
-            h2[k][lane] = normal[2];
-            if (with_distortion) {{
-                g_bend[k][lane] = 2.0f * g_distortion.data[pixel];
-                D_all[k][lane] = depths.data[pixel];
-                T_end[k][lane] = t_end;
+    // R starts as the sum of all images times their gradients, as in the text for one pixel below. An
+    // expected
+    // depth D / alpha counts as D with a gradient at alpha of its own.
+    {{
+        F end_[16], on_alpha[16], value[4][16];
+        F* const ends[1] = {{end_}};
+        F* const on_alphas[1] = {{on_alpha}};
+        F* const values[4] = {{value[0], value[1], value[2], value[3]}};
+        F* const own[4] = {{g0, g1, g2, g_depth}};
+        F* gradients[4];
+        for (int i = 0; i < channels_out; ++i) gradients[i] = i < colours ? own[i] : g_depth;
+        for (int k = 0; k < 16; ++k) on_alpha[k] = zero;
+        read_image(transmittance.data, 1, ends);
+        if (g_alphas.data) read_image(g_alphas.data, 1, on_alphas);
+        read_image(image.data, channels_out, values);
+        read_image(g_image.data, channels_out, gradients);
+        for (int k = 0; k < 16; ++k) {{
+            for (int i = 0; i < channels_out; ++i) R[k] = fma(value[i][k], gradients[i][k], R[k]);
+            if (divided) {{
+                const F alpha = one - end_[k];
+                const F share = g_depth[k] / max_(alpha, (F)1e-10f);
+                on_alpha[k] -= alpha > (F)1e-10f ? share * value[colours][k] : zero;
+                g_depth[k] = share;
             }}
-            if (with_median) {{
-                g_median[k][lane] = g_medians.data[pixel];
-                median_at[k][lane] = medians_at.data[pixel];
+            R[k] = fma(-end_[k], on_alpha[k], R[k]);
+            T_end[k] = end_[k];
+        }}
+        if (g_normals.data) {{
+            F* const own_normals[3] = {{h0, h1, h2}};
+            read_image(normals.data, 3, values);
+            read_image(g_normals.data, 3, own_normals);
+            for (int k = 0; k < 16; ++k) {{
+                R[k] = fma(value[0][k], h0[k], fma(value[1][k], h1[k], fma(value[2][k], h2[k], R[k])));
             }}
+        }}
+        if (with_distortion) {{
+            F* const bends[1] = {{g_bend}};
+            F* const depth_sums[1] = {{D_all}};
+            read_image(distortion.data, 1, values);
+            read_image(g_distortion.data, 1, bends);
+            read_image(depths.data, 1, depth_sums);
+            for (int k = 0; k < 16; ++k) {{
+                g_bend[k] = g_bend[k] + g_bend[k];
+                R[k] = fma(value[0][k], g_bend[k], R[k]);
+            }}
+        }}
+        if (with_median) {{
+            F* const own_medians[1] = {{g_median}};
+            F* const positions[1] = {{(F*)median_at}};
+            read_image(g_medians.data, 1, own_medians);
+            read_image((const float*)medians_at.data, 1, positions);
         }}
     }}
 
@@ -261,7 +291,7 @@ _TILE = f"""
                 blurred &= blurred - 1;
                 const F x = X[k], y = Y[k], at_x = x, at_y = y;
                 F t = T[k];
-{RAY}{BLUR}{HIT}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}{PASS}
+{RAY}{LOW}{HIT}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}{PASS}
                 T[k] = t;
                 if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
             }}

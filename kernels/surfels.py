@@ -16,7 +16,7 @@ thinner than a pixel. Every surfel seen by a camera becomes one record of 24 flo
     CENTER        2  projected centre in pixels
     U, V, SLOPE   6  1/pixel
     EXTENT        1  sqrt(u^2 + v^2) where alpha = 1/255
-    REACH         1  the longest (U . e, V . e) from a 4 x 4 block's centre to its corners
+    BLUR          1  pixels from the mean in x or y outside which no pixel's low-pass is both seen and larger
     BOX           4  centre and half extents in pixels of the box outside which alpha < 1/255
     LOG2_OPACITY  1  base-2 logarithm of the opacity
     DEPTH         1  camera-space z of the centre in metres
@@ -60,7 +60,7 @@ U = 4
 V = 6
 SLOPE = 8
 EXTENT = 10
-REACH = 11
+BLUR = 11
 BOX = 12
 LOG2_OPACITY = 16
 DEPTH = 17
@@ -140,7 +140,7 @@ _PROJECT = f"""
     const F ea = s0 * s0 * scaled, eb = s1 * s1 * scaled;
     const F half_x = sqrt_(mid_x * mid_x + ea * iax * iax + eb * ibx * ibx);
     const F half_y = sqrt_(mid_y * mid_y + ea * iay * iay + eb * iby * iby);
-    const F blur = extent * {LOG2_E**-0.5!r}f;
+    const F blur = extent * {float(SLACK) * LOG2_E**-0.5!r}f;
     const F low_x = min_(mid_x - half_x, shift_x - blur), high_x = max_(mid_x + half_x, shift_x + blur);
     const F low_y = min_(mid_y - half_y, shift_y - blur), high_y = max_(mid_y + half_y, shift_y + blur);
     const F mean_x = select(bounded, center_x + 0.5f * (low_x + high_x), splat(0.5f * (float)width));
@@ -177,8 +177,22 @@ _PROJECT = f"""
             }}
         }}
     }}
-    const F corner_x = u_x + u_y, corner_y = v_x + v_y, other_x = u_x - u_y, other_y = v_x - v_y;
-    const F corner2 = max_(corner_x * corner_x + corner_y * corner_y, other_x * other_x + other_y * other_y);
+
+    // With s the largest |(U . e, V . e)| / |e| and t = sqrt(log2(e)), the low-pass is larger only where
+    // t W d < s |e|. So where 0.9 t > s, and W > 0.9 all over the low-pass, it is larger at most at
+    // d < shift s / (0.9 t - s): hardly anywhere, and where no pixel's centre lies in that square, nowhere.
+    const F trace = u_x * u_x + u_y * u_y + v_x * v_x + v_y * v_y, det = u_x * v_y - u_y * v_x;
+    const F gap = sqrt_(max_(trace * trace - 4.0f * det * det, zero));
+    const F steep = sqrt_(0.5f * (trace + gap)) * {float(SLACK)!r}f;
+    const F shift = sqrt_(shift_x * shift_x + shift_y * shift_y);
+    const F slope = sqrt_(w_x * w_x + w_y * w_y);
+    const F margin = {0.9 * LOG2_E**0.5!r}f - steep;
+    const F tight = shift * steep / margin * 1.01f + 1.0e-3f + 1.0e-6f * (abs_(center_x) + abs_(center_y));
+    const I gentle = (margin > 0.05f) & (slope * (blur + shift) < 0.1f) & (tight < blur);
+    const F pixel_x = center_x + shift_x - 0.5f, pixel_y = center_y + shift_y - 0.5f;
+    const F off_x = abs_(pixel_x - floor_(pixel_x + 0.5f)), off_y = abs_(pixel_y - floor_(pixel_y + 0.5f));
+    const F nowhere = splat(-1.0e9f);
+    const F blurred = select(gentle, select((off_x > tight) | (off_y > tight), nowhere, tight), blur);
     fields[{MEAN}] = center_x + shift_x;
     fields[{MEAN + 1}] = center_y + shift_y;
     fields[{CENTER}] = center_x;
@@ -199,7 +213,7 @@ _PROJECT = f"""
     fields[{BOX + 1}] = mean_y;
     fields[{BOX + 2}] = box_x;
     fields[{BOX + 3}] = box_y;
-    fields[{REACH}] = {1.5 * float(SLACK)!r}f * sqrt_(corner2);
+    fields[{BLUR}] = blurred;
     float* const record = records_out.data + first * {RECORD};
     F later[16];
     for (int i = 0; i < {RECORD}; ++i) fields[i] = select(drawn, fields[i], zero);
