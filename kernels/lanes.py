@@ -9,6 +9,8 @@ per thread on a GPU. The snippet must declare `const int lanes` before: how many
     add(p, stride, v)      the same, added to what is there
     load_rows(p, stride, rows)   lane j of rows[i] from p[j stride + i], i < 16
     store_rows(p, stride, rows)  the other way; leaves `rows` changed
+    load3(p, out), load4(p, out)   lane j of out[i] from p[3 j + i], p[4 j + i]
+    store3(p, in), store4(p, in)   the other way
     splat(x)               x in all lanes
     sqrt_(v), min_(v, w), max_(v, w), abs_(v), floor_(v), ceil_(v), log2_(v)
     select(mask, v, w)     v where the mask is set, else w
@@ -51,6 +53,46 @@ TRANSPOSE = "".join(
 
 """CPU text: transposes the 16 vectors F of `rows`."""
 
+
+def _pick(sources: list[str], numbers: list[int]) -> str:
+    """A vector whose lane j is number `numbers[j]` of the sources laid end to end, 16 numbers each."""
+    picked = "(F)0.0f"
+    for first in range(0, len(sources), 2):
+        pair = sources[first : first + 2]
+        here = [number - 16 * first if 0 <= number - 16 * first < 32 else -1 for number in numbers]
+        joined = f"__builtin_shufflevector({pair[0]}, {pair[-1]}, {', '.join(map(str, here))})"
+        lanes = [16 + j if here[j] >= 0 else j for j in range(16)]
+        picked = (
+            joined
+            if first == 0
+            else (f"__builtin_shufflevector({picked}, {joined}, {', '.join(map(str, lanes))})")
+        )
+    return picked
+
+
+def _packed(n: int) -> str:
+    """Text of `load{n}` and `store{n}`: lanes of n numbers each, side by side in memory."""
+    loads = "".join(f"F v{m}; __builtin_memcpy(&v{m}, p + {16 * m}, 64); " for m in range(n))
+    vectors = [f"v{m}" for m in range(n)]
+    splits = "".join(f"out[{c}] = {_pick(vectors, [n * j + c for j in range(16)])}; " for c in range(n))
+    parts = [f"in[{c}]" for c in range(n)]
+    joins = "".join(
+        f"const F v{m} = {_pick(parts, [16 * (f % n) + f // n for f in range(16 * m, 16 * m + 16)])}; "
+        f"__builtin_memcpy(p + {16 * m}, &v{m}, 64); "
+        for m in range(n)
+    )
+    return f"""
+    auto load{n} = [&](const float* p, F* out) {{
+        if (lanes == 16) {{ {loads} {splits} return; }}
+        for (int i = 0; i < {n}; ++i) out[i] = load(p + i, {n});
+    }};
+    auto store{n} = [&](float* p, const F* in) {{
+        if (lanes == 16) {{ {joins} return; }}
+        for (int i = 0; i < {n}; ++i) store(p + i, {n}, in[i]);
+    }};
+"""
+
+
 SUM_LANES = (
     "".join(
         f"""
@@ -83,6 +125,10 @@ PRELUDE = (
     auto add = [&](float* p, int, F v) { *p += v; };
     auto load_rows = [&](const float* p, int, F* rows) { for (int i = 0; i < 16; ++i) rows[i] = p[i]; };
     auto store_rows = [&](float* p, int, F* rows) { for (int i = 0; i < 16; ++i) p[i] = rows[i]; };
+    auto load3 = [&](const float* p, F* out) { for (int i = 0; i < 3; ++i) out[i] = p[i]; };
+    auto load4 = [&](const float* p, F* out) { for (int i = 0; i < 4; ++i) out[i] = p[i]; };
+    auto store3 = [&](float* p, const F* in) { for (int i = 0; i < 3; ++i) p[i] = in[i]; };
+    auto store4 = [&](float* p, const F* in) { for (int i = 0; i < 4; ++i) p[i] = in[i]; };
     auto splat = [](float x) { return x; };
     auto lane = [](F v, int) { return v; };
     auto lane_int = [](I v, int) { return v; };
@@ -130,6 +176,10 @@ PRELUDE = (
         transpose(rows);
         for (int j = 0; j < lanes; ++j) __builtin_memcpy(p + j * (size_t)stride, &rows[j], 64);
     };
+"""
+    + _packed(3)
+    + _packed(4)
+    + """
     auto splat = [](float x) { return (F)x; };
     auto lane = [](F v, int j) { return v[j]; };
     auto lane_int = [](I v, int j) { return v[j]; };

@@ -61,7 +61,9 @@ SLACK = wp.constant(1.0001)
 ROTATION = """
     // Rotation matrix q of quaternions wxyz of any length but (nearly) zero: NaN there.
     const float* const quat = (const float*)(quats.data + n);
-    const F qw0 = load(quat, 4), qx0 = load(quat + 1, 4), qy0 = load(quat + 2, 4), qz0 = load(quat + 3, 4);
+    F wxyz[4];
+    load4(quat, wxyz);
+    const F qw0 = wxyz[0], qx0 = wxyz[1], qy0 = wxyz[2], qz0 = wxyz[3];
     const F largest_q = max_(max_(abs_(qw0), abs_(qx0)), max_(abs_(qy0), abs_(qz0)));
     const F longest = select(largest_q > 1e-30f, largest_q, splat(0.0f));
     const F qw1 = qw0 / longest, qx1 = qx0 / longest, qy1 = qy0 / longest, qz1 = qz0 / longest;
@@ -81,7 +83,9 @@ CAMERA = """
     const float r00 = view[0], r01 = view[1], r02 = view[2], r10 = view[4], r11 = view[5], r12 = view[6],
         r20 = view[8], r21 = view[9], r22 = view[10];
     const float* const mean = (const float*)(means.data + n);
-    const F mx = load(mean, 3), my = load(mean + 1, 3), mz = load(mean + 2, 3);
+    F position[3];
+    load3(mean, position);
+    const F mx = position[0], my = position[1], mz = position[2];
     const F x = r00 * mx + r01 * my + r02 * mz + view[3];
     const F y = r10 * mx + r11 * my + r12 * mz + view[7];
     const F z = r20 * mx + r21 * my + r22 * mz + view[11];
@@ -114,7 +118,9 @@ COVARIANCE = """
 
     // Along the Gaussian's axes, then times its scales: the 2D covariance is M M^T with rows m_x, m_y.
     const float* const scale = (const float*)(scales.data + n);
-    const F s0 = load(scale, 3), s1 = load(scale + 1, 3), s2 = load(scale + 2, 3);
+    F deviations[3];
+    load3(scale, deviations);
+    const F s0 = deviations[0], s1 = deviations[1], s2 = deviations[2];
     const F ax0 = q00 * wx0 + q10 * wx1 + q20 * wx2, ax1 = q01 * wx0 + q11 * wx1 + q21 * wx2,
         ax2 = q02 * wx0 + q12 * wx1 + q22 * wx2;
     const F ay0 = q00 * wy0 + q10 * wy1 + q20 * wy2, ay1 = q01 * wy0 + q11 * wy1 + q21 * wy2,
@@ -160,13 +166,14 @@ BIN = f"""
     int* const radius = (int*)(radii_out.data + first);
     short* const rect = (short*)(rects_out.data + first);
     int* const order = order_out.data + (size_t)camera * order_out.shape[1] + n;
+    // By way of memory: a lane whose number is not a constant is slow to take from a vector.
+    const I numbers[6] = {{radius_x, radius_y, begin_x, begin_y, end_x, end_y}};
+    int number[6][16];
+    for (int i = 0; i < 6; ++i) memcpy(number[i], &numbers[i], sizeof(I));
     for (int j = 0; j < lanes; ++j) {{
-        radius[2 * j] = lane_int(radius_x, j);
-        radius[2 * j + 1] = lane_int(radius_y, j);
-        rect[4 * j] = (short)lane_int(begin_x, j);
-        rect[4 * j + 1] = (short)lane_int(begin_y, j);
-        rect[4 * j + 2] = (short)lane_int(end_x, j);
-        rect[4 * j + 3] = (short)lane_int(end_y, j);
+        radius[2 * j] = number[0][j];
+        radius[2 * j + 1] = number[1][j];
+        for (int i = 0; i < 4; ++i) rect[4 * j + i] = (short)number[2 + i][j];
         order[j] = (int)first + j;
     }}
 """

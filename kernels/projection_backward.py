@@ -52,18 +52,28 @@ QUATERNION_GRADIENT = """
 
 WRITE = """
         // The first camera writes, later ones add; what is not drawn or not finite counts nothing.
+        auto kept = [&](F v) { return select(shown & finite(v), v, zero); };
         auto write = [&](float* p, int stride, F v) {
-            const F kept = select(shown & finite(v), v, zero);
-            if (camera == 0) store(p, stride, kept); else add(p, stride, kept);
+            if (camera == 0) store(p, stride, kept(v)); else add(p, stride, kept(v));
+        };
+        auto write3 = [&](float* p, F v0, F v1, F v2) {
+            F sums[3] = {zero, zero, zero};
+            if (camera > 0) load3(p, sums);
+            sums[0] += kept(v0), sums[1] += kept(v1), sums[2] += kept(v2);
+            store3(p, sums);
+        };
+        auto write4 = [&](float* p, F v0, F v1, F v2, F v3) {
+            F sums[4] = {zero, zero, zero, zero};
+            if (camera > 0) load4(p, sums);
+            sums[0] += kept(v0), sums[1] += kept(v1), sums[2] += kept(v2), sums[3] += kept(v3);
+            store4(p, sums);
         };
 """
 
 MEAN_GRADIENT = """
         // (gx, gy, gz) at the camera-space point.
-        float* const g_mean = (float*)(g_means_out.data + n);
-        write(g_mean, 3, r00 * gx + r10 * gy + r20 * gz);
-        write(g_mean + 1, 3, r01 * gx + r11 * gy + r21 * gz);
-        write(g_mean + 2, 3, r02 * gx + r12 * gy + r22 * gz);
+        write3((float*)(g_means_out.data + n), r00 * gx + r10 * gy + r20 * gz, r01 * gx + r11 * gy + r21 * gz,
+            r02 * gx + r12 * gy + r22 * gz);
 """
 
 CAMERA_GRADIENT = """
@@ -161,10 +171,8 @@ _BACKWARD = f"""
             gmx2 = 2.0f * g_xx * mx2 + g_xy * my2;
         const F gmy0 = 2.0f * g_yy * my0 + g_xy * mx0, gmy1 = 2.0f * g_yy * my1 + g_xy * mx1,
             gmy2 = 2.0f * g_yy * my2 + g_xy * mx2;
-        float* const g_scale = (float*)(g_scales_out.data + n);
-        write(g_scale, 3, gmx0 * ax0 + gmy0 * ay0);
-        write(g_scale + 1, 3, gmx1 * ax1 + gmy1 * ay1);
-        write(g_scale + 2, 3, gmx2 * ax2 + gmy2 * ay2);
+        write3((float*)(g_scales_out.data + n), gmx0 * ax0 + gmy0 * ay0, gmx1 * ax1 + gmy1 * ay1,
+            gmx2 * ax2 + gmy2 * ay2);
         const F hx0 = gmx0 * s0, hx1 = gmx1 * s1, hx2 = gmx2 * s2, hy0 = gmy0 * s0, hy1 = gmy1 * s1, hy2 = gmy2 * s2;
         const F gq00 = wx0 * hx0 + wy0 * hy0, gq01 = wx0 * hx1 + wy0 * hy1, gq02 = wx0 * hx2 + wy0 * hy2;
         const F gq10 = wx1 * hx0 + wy1 * hy0, gq11 = wx1 * hx1 + wy1 * hy1, gq12 = wx1 * hx2 + wy1 * hy2;
@@ -180,11 +188,7 @@ _BACKWARD = f"""
         gr10 += jx1 * gwx0 + jy1 * gwy0, gr11 += jx1 * gwx1 + jy1 * gwy1, gr12 += jx1 * gwx2 + jy1 * gwy2;
         gr20 += jx2 * gwx0 + jy2 * gwy0, gr21 += jx2 * gwx1 + jy2 * gwy1, gr22 += jx2 * gwx2 + jy2 * gwy2;
 {QUATERNION_GRADIENT}
-        float* const g_quat = (float*)(g_quats_out.data + n);
-        write(g_quat, 4, g_qw);
-        write(g_quat + 1, 4, g_qx);
-        write(g_quat + 2, 4, g_qy);
-        write(g_quat + 3, 4, g_qz);
+        write4((float*)(g_quats_out.data + n), g_qw, g_qx, g_qy, g_qz);
 
         // Jacobian and mean -> camera-space point and intrinsics.
         const F gpx = -gjx2 * inverse_z, gpy = -gjy2 * inverse_z;

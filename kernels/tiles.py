@@ -33,6 +33,56 @@ def first_tile(rect: vec4s, camera: int, tiles_x: int, tiles_y: int) -> int:
     return (camera * tiles_y + int(rect[1])) * tiles_x + int(rect[0])
 
 
+_EACH = """
+    const int count = order.shape[1] / 2, cameras = order.shape[0];
+    const int begin = (int)((long long)count * part / parts), end = (int)((long long)count * (part + 1) / parts);
+    int* const counts = counts_out.data + (size_t)part * counts_out.shape[1];
+    const short* const rect = (const short*)rects.data;
+    for (int camera = 0; camera < cameras; ++camera) {
+        const int* const sorted = order.data + (size_t)camera * order.shape[1];
+        for (int i = begin; i < end; ++i) {
+#if !defined(__CUDACC__)
+            if (i + 16 < end) __builtin_prefetch(rect + 4 * (size_t)sorted[i + 16]);
+#endif
+            const int g = sorted[i];
+            const short* const r = rect + 4 * (size_t)g;
+            const int x_begin = r[0], y_begin = r[1], x_end = r[2], y_end = r[3];
+            for (int y = y_begin; y < y_end; ++y) {
+                const int row = (camera * tiles_y + y) * tiles_x;
+                for (int x = x_begin; x < x_end; ++x) {
+                    {here}
+                }
+            }
+        }
+    }
+"""
+
+
+@wp.func_native(_EACH.replace("{here}", "++counts[row + x];"))
+def count_part(
+    part: int,
+    parts: int,
+    order: wp.array2d[int],
+    rects: wp.array[vec4s],
+    tiles_x: int,
+    tiles_y: int,
+    counts_out: wp.array2d[int],
+): ...
+
+
+@wp.func_native(_EACH.replace("{here}", "ids_out.data[counts[row + x]++] = g;"))
+def fill_part(
+    part: int,
+    parts: int,
+    order: wp.array2d[int],
+    rects: wp.array[vec4s],
+    tiles_x: int,
+    tiles_y: int,
+    counts_out: wp.array2d[int],
+    ids_out: wp.array[int],
+): ...
+
+
 @wp.kernel
 def count_tiles(
     start: int,
@@ -46,21 +96,7 @@ def count_tiles(
     counts_out: wp.array2d[int],
 ):
     """Part p of the Gaussians: how many touch each tile. `counts_out` [parts, tiles] starts at zero."""
-    part = start + wp.tid()
-    begin = int(wp.int64(order.shape[1] / 2) * wp.int64(part) / wp.int64(parts))
-    end = int(wp.int64(order.shape[1] / 2) * wp.int64(part + 1) / wp.int64(parts))
-    for camera in range(order.shape[0]):
-        for i in range(begin, end):
-            g = order[camera, i]
-            rect = rects[g]
-            tile = first_tile(rect, camera, tiles_x, tiles_y)
-            right = tile + int(rect[2]) - int(rect[0])
-            for _j in range(area(rect)):
-                counts_out[part, tile] = counts_out[part, tile] + 1
-                tile += 1
-                if tile == right:
-                    tile += tiles_x - (int(rect[2]) - int(rect[0]))
-                    right += tiles_x
+    count_part(start + wp.tid(), parts, order, rects, tiles_x, tiles_y, counts_out)
 
 
 @wp.kernel
@@ -97,23 +133,7 @@ def fill_tiles(
     ids_out: wp.array[int],
 ):
     """Part p of the Gaussians: write each into the lists of its tiles, from `next_out` [parts, tiles] on."""
-    part = start + wp.tid()
-    begin = int(wp.int64(order.shape[1] / 2) * wp.int64(part) / wp.int64(parts))
-    end = int(wp.int64(order.shape[1] / 2) * wp.int64(part + 1) / wp.int64(parts))
-    for camera in range(order.shape[0]):
-        for i in range(begin, end):
-            g = order[camera, i]
-            rect = rects[g]
-            tile = first_tile(rect, camera, tiles_x, tiles_y)
-            right = tile + int(rect[2]) - int(rect[0])
-            for _j in range(area(rect)):
-                at = next_out[part, tile]
-                ids_out[at] = g
-                next_out[part, tile] = at + 1
-                tile += 1
-                if tile == right:
-                    tile += tiles_x - (int(rect[2]) - int(rect[0]))
-                    right += tiles_x
+    fill_part(start + wp.tid(), parts, order, rects, tiles_x, tiles_y, next_out, ids_out)
 
 
 @wp.kernel

@@ -12,6 +12,7 @@ from gdpro_sim.device import device_name, launch_chunked, run_chunks, serial_tor
 from gdpro_sim.kernels import compositing as kernels
 from gdpro_sim.kernels import compositing_backward
 from gdpro_sim.kernels.projection import BOX, CHANNELS, MEAN, RECORD, TILE
+from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.projection import Projection, View, array
 from gdpro_sim.splatting.slabs import add_over_tiles, balanced_slabs
 from gdpro_sim.splatting.tiles import TileLists
@@ -134,9 +135,9 @@ class _Blend(torch.autograd.Function):
         columns, rows = view.tiles
         tiles = len(backgrounds) * rows * columns
         pixels = len(backgrounds) * view.height * view.width
-        image = backgrounds.new_empty((pixels, blending.count))
-        alphas = backgrounds.new_empty(pixels)
-        transmittance = backgrounds.new_empty(pixels)
+        image = buffers.empty((pixels, blending.count), backgrounds.dtype, backgrounds.device)
+        alphas = buffers.empty((pixels,), backgrounds.dtype, backgrounds.device)
+        transmittance = buffers.empty((pixels,), backgrounds.dtype, backgrounds.device)
         stops = torch.empty(tiles if blending.tile else pixels, dtype=torch.int32, device=backgrounds.device)
         inputs = [
             *_sources(records, channels, lists),

@@ -11,6 +11,7 @@ import warp as wp
 from gdpro_sim.device import run_chunks, thread_count
 from gdpro_sim.kernels import slabs as kernels
 from gdpro_sim.kernels.projection import vec4s
+from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.projection import View, array
 from gdpro_sim.splatting.tiles import TileLists
 
@@ -45,7 +46,7 @@ def add_over_tiles(
     tiles = len(lists.offsets) - 1
     columns, rows = view.tiles
     rects_array = array(rects, vec4s)
-    sums = torch.zeros(len(rects), width)
+    sums = buffers.empty((len(rects), width), torch.float32, rects.device).zero_()
     sums_array = array(sums, wp.float32)
     slabs = min(thread_count(), tiles)
     if slabs == 1:
@@ -81,7 +82,7 @@ def add_over_tiles(
     total = int(ends[-1])
     begins = (ends - counts).to(torch.int32)
     spill_ids = torch.full((total,), -1, dtype=torch.int32)
-    spills = torch.empty(total, width)
+    spills = buffers.empty((total, width), torch.float32, rects.device)
     arguments = [
         array(begins, wp.int32),
         sums_array,

@@ -10,6 +10,7 @@ import warp as wp
 from gdpro_sim.device import device_name, launch_chunked, thread_count
 from gdpro_sim.kernels import tiles as kernels
 from gdpro_sim.kernels.projection import vec4s
+from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.checks import INDEX_LIMIT, check_count
 from gdpro_sim.splatting.projection import Projection, View, array, sort_pairs
 
@@ -55,7 +56,8 @@ def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT)
     launch_chunked(kernels.count_tiles, parts, inputs, [counts_array], device="cpu", minimum=1)
     outputs = [counts_array, array(offsets, wp.int32), array(entries, wp.int64)]
     launch_chunked(kernels.scan_tiles, 1, [], outputs, device="cpu")
-    ids = torch.empty(check_count("tile list entries", int(entries), limit), dtype=torch.int32)
+    total = check_count("tile list entries", int(entries), limit)
+    ids = buffers.empty((total,), torch.int32, offsets.device)
     outputs = [counts_array, array(ids, wp.int32)]
     launch_chunked(kernels.fill_tiles, parts, inputs, outputs, device="cpu", minimum=1)
     return TileLists(offsets, ids)
