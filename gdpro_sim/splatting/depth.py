@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-import torch
+from typing import Any
 
+import torch
+import warp as wp
+
+from gdpro_sim.device import device_name, launch_chunked, torch_stream
+from gdpro_sim.kernels import depth as kernels
 from gdpro_sim.splatting.images import check_images
+from gdpro_sim.splatting.projection import array
 
 
 def depth_to_normals(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
@@ -29,6 +35,14 @@ def depth_to_normals(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tens
     _check_matrices(depth, viewmats=viewmats, Ks=Ks)
     if height < 3 or width < 3:
         return depth.expand(-1, -1, -1, 3) * 0.0
+    if depth.dtype == torch.float32:
+        return _Normals.apply(depth.contiguous(), viewmats.contiguous(), Ks.contiguous())
+    return _normals(depth, viewmats, Ks)
+
+
+def _normals(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
+    """The same in torch, in any precision."""
+    height, width = depth.shape[1:3]
     z = depth[..., 0]
     fx, skew, cx = (Ks[:, 0, i, None, None] for i in range(3))
     fy, cy = (Ks[:, 1, i, None, None] for i in (1, 2))
@@ -50,6 +64,70 @@ def depth_to_normals(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tens
     normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
     normal = torch.where(seen[..., None], normal, torch.zeros_like(one))
     return torch.nn.functional.pad(normal, (0, 0, 1, 1, 1, 1))
+
+
+class _Normals(torch.autograd.Function):
+    """The same in float32, by kernels."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor
+    ) -> torch.Tensor:
+        normals = depth.new_empty((*depth.shape[:3], 3))
+        inputs, indices = _spans(depth, viewmats, Ks)
+        outputs = [array(normals.view(-1), wp.float32)]
+        with torch_stream(depth):
+            launch_chunked(
+                kernels.depth_normals, indices, inputs, outputs, device=device_name(depth), minimum=32
+            )
+        ctx.save_for_backward(depth, viewmats, Ks)
+        return normals
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        depth, viewmats, Ks = ctx.saved_tensors
+        inputs, indices = _spans(depth, viewmats, Ks)
+        with_cameras = ctx.needs_input_grad[1] or ctx.needs_input_grad[2]
+        g_ratios = depth.new_empty((2, depth.numel()))
+        g_cameras = depth.new_empty((indices if with_cameras else 0, kernels.CAMERA_GRADIENTS))
+        g_depth = torch.empty_like(depth)
+        device = device_name(depth)
+        with torch_stream(depth):
+            given = array(gradients[0].contiguous().view(-1), wp.float32)
+            outputs = [array(g_ratios, wp.float32), array(g_cameras, wp.float32)]
+            launch_chunked(
+                kernels.depth_normals_backward, indices, [*inputs, given], outputs, device=device, minimum=32
+            )
+            span, z, _, _, width, height = inputs
+            inputs = [span, z, width, height, array(g_ratios, wp.float32)]
+            outputs = [array(g_depth.view(-1), wp.float32)]
+            launch_chunked(kernels.depth_normals_gather, indices, inputs, outputs, device=device, minimum=32)
+        if not with_cameras or indices == 0:
+            return g_depth, None, None
+        # A cumulative sum goes in order, a sum as it likes.
+        total = torch.cumsum(g_cameras.double().view(len(depth), -1, kernels.CAMERA_GRADIENTS), 1)[
+            :, -1
+        ].float()
+        g_viewmats, g_Ks = torch.zeros_like(viewmats), torch.zeros_like(Ks)
+        g_viewmats[:, :3, :3] = total[:, :9].view(-1, 3, 3)
+        g_Ks[:, 0] = total[:, 9:12]
+        g_Ks[:, 1, 1:] = total[:, 12:]
+        return g_depth, g_viewmats, g_Ks
+
+
+def _spans(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor) -> tuple[list[Any], int]:
+    """First arguments of the kernels, and their number of indices."""
+    count, height, width = depth.shape[:3]
+    span = width if depth.device.type == "cpu" else 32
+    inputs = [
+        span,
+        array(depth.view(-1), wp.float32),
+        array(viewmats, wp.mat44),
+        array(Ks, wp.mat33),
+        width,
+        height,
+    ]
+    return inputs, count * height * -(-width // span)
 
 
 def _check_matrices(depth: torch.Tensor, *, viewmats: object, Ks: object) -> None:

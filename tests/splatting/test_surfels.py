@@ -14,6 +14,7 @@ from torch import Tensor
 from gdpro_sim import device
 from gdpro_sim.errors import RequestError
 from gdpro_sim.splatting import RasterOptions, contributions, rasterization_2dgs
+from gdpro_sim.splatting.depth import depth_to_normals
 from tests.splatting.scenes import cameras, cloud, features, frontal, harmonics
 
 SIZE = 64
@@ -290,6 +291,28 @@ def test_any_numbers_give_finite_images_and_gradients(method: str, data: st.Data
     for gradient in found:
         assert torch.isfinite(gradient).all()
     assert all((gradient[(outputs[6]["radii"][0] == 0).all(-1)] == 0).all() for gradient in found)
+
+
+@pytest.mark.parametrize(
+    ("count", "height", "width"), [(1, 64, 64), (2, 29, 37), (1, 3, 3), (2, 5, 4), (1, 20, 17)]
+)
+def test_normals_from_depth_in_single_precision(count: int, height: int, width: int) -> None:
+    """Kernels against torch in double precision, holes included."""
+    g = torch.Generator().manual_seed(width)
+    depth = 1.0 + torch.rand(count, height, width, 1, generator=g)
+    depth *= torch.rand(count, height, width, 1, generator=g) > 0.2
+    viewmats = torch.eye(4).repeat(count, 1, 1) + 0.1 * torch.randn(count, 4, 4, generator=g)
+    Ks = torch.tensor([[[50.0, 3.0, width / 2], [0.0, 60.0, height / 2], [0.0, 0.0, 1.0]]]).repeat(
+        count, 1, 1
+    )
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        given_ = [tensor.to(dtype).requires_grad_() for tensor in (depth, viewmats, Ks)]
+        normals = depth_to_normals(*given_)
+        weights = torch.randn(normals.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
+        found.append([normals, *torch.autograd.grad(normals, given_, weights)])
+    for single, double in zip(*found, strict=True):
+        assert (single - double).norm() <= 1e-6 * double.norm()
 
 
 @pytest.fixture
