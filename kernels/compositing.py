@@ -16,6 +16,7 @@ Up to four channels are blended at once; more channels run again over the same l
 import warp as wp
 
 from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
+from gdpro_sim.kernels.surfel_images import IMAGES
 from gdpro_sim.kernels.projection import (
     BOX,
     CHANNELS,
@@ -67,7 +68,6 @@ TILE_LANES = f"""
     typedef bool M __attribute__((ext_vector_type(16)));
     const F column = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}};
     const F row = {{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
-    const F block_x = 4.0f * column, block_y = 4.0f * row;
     const I lane_number = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
     const F inside = (F)1.0f, outside = (F)-1.0f, zero = (F)0.0f;
     auto fma = [](F a, F b, F c) {{ return __builtin_elementwise_fma(a, b, c); }};
@@ -128,16 +128,6 @@ BLEND = """
             const F w = blend ? alpha * t : zero;
 """
 """CPU snippet: raw alpha and transmittance t -> weights w of the lanes that blend."""
-
-ADVANCE = """
-            T[k] = blend ? next : t;
-            const I stop = seen & ~blend;
-            if (__builtin_expect(bits(stop & (t > 0.0f)) != 0, 0)) {
-                T[k] = stop ? -__builtin_elementwise_abs(t) : T[k];
-                if (!bits(T[k] > 0.0f)) alive &= ~(1u << k);
-            }
-"""
-"""CPU snippet: transmittance behind block k."""
 
 PASS = """
             const F passed = blend ? next : t;
@@ -219,7 +209,7 @@ _BATCH = (
 
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{TILE_LANES}
+{LOCATE_TILE}{TILE_LANES}{IMAGES}
 {BATCH_STATE}
     F c0[16], c1[16], c2[16], c3[16];
     for (int k = 0; k < 16; ++k) c0[k] = c1[k] = c2[k] = c3[k] = zero;
@@ -250,24 +240,24 @@ _TILE = f"""
         at += held;
     }}
 
-    // Write what lies inside the image, over the background; expected depth is divided by alpha.
+    // Over the background; expected depth is divided by alpha.
     const float* const background = backgrounds.data + (size_t)camera * count;
-    for (int y = 0; y < y_end; ++y) {{
-        for (int x = 0; x < x_end; ++x) {{
-            const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
-            const float t = T[k][lane] < 0.0f ? -T[k][lane] : T[k][lane];
-            const float alpha = 1.0f - t;
-            const float sum[4] = {{c0[k][lane], c1[k][lane], c2[k][lane], c3[k][lane]}};
-            const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
-            float* const out = image_out.data + pixel * count;
-            for (int i = 0; i < count; ++i) {{
-                out[i] = sum[i] + t * background[i];
-                if (i == divided) out[i] = sum[i] / (alpha > 1e-10f ? alpha : 1e-10f);
-            }}
-            transmittance_out.data[pixel] = t;
-            alphas_out.data[pixel] = alpha;
+    F* const sums[4] = {{c0, c1, c2, c3}};
+    F alphas[16];
+    for (int k = 0; k < 16; ++k) {{
+        T[k] = __builtin_elementwise_abs(T[k]);
+        alphas[k] = one - T[k];
+        for (int i = 0; i < count; ++i) {{
+            if (i == divided) sums[i][k] /= __builtin_elementwise_max(alphas[k], (F)1e-10f);
+            else sums[i][k] = fma(T[k], (F)background[i], sums[i][k]);
         }}
     }}
+    const F* const planes[4] = {{c0, c1, c2, c3}};
+    const F* const alpha_planes[1] = {{alphas}};
+    const F* const transmittance_planes[1] = {{T}};
+    write_image(image_out.data, count, planes);
+    write_image(alphas_out.data, 1, alpha_planes);
+    write_image(transmittance_out.data, 1, transmittance_planes);
     stops_out.data[tile] = at;
 #endif
 """

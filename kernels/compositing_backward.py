@@ -27,6 +27,7 @@ from gdpro_sim.kernels.compositing import (
     POWER,
     TILE_LANES,
 )
+from gdpro_sim.kernels.surfel_images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
 from gdpro_sim.kernels.projection import (
     BOX,
@@ -95,25 +96,37 @@ _BATCH = (
 
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{TILE_LANES}{SUM_LANES}{IN_SLAB}
+{LOCATE_TILE}{TILE_LANES}{IMAGES}{SUM_LANES}{IN_SLAB}
     const bool whole = slab_begin == 0 && slab_end == offsets.shape[0] - 1;
     int spill = whole ? 0 : spill_begins.data[tile];
     F R[16], g0[16], g1[16], g2[16], g3[16];
-    for (int k = 0; k < 16; ++k) R[k] = g0[k] = g1[k] = g2[k] = g3[k] = zero;
-    for (int y = 0; y < y_end; ++y) {{
-        for (int x = 0; x < x_end; ++x) {{
-            const int k = (y >> 2) * 4 + (x >> 2), lane = (y & 3) * 4 + (x & 3);
-            const size_t pixel = ((size_t)camera * height + tile_y + y) * width + tile_x + x;
-            float gradient[4] = {{0.0f, 0.0f, 0.0f, 0.0f}};
-{_PIXEL_GRADIENT}
-            R[k][lane] = behind;
-            g0[k][lane] = gradient[0];
-            g1[k][lane] = gradient[1];
-            g2[k][lane] = gradient[2];
-            g3[k][lane] = gradient[3];
+    F o0[16], o1[16], o2[16], o3[16], on_alpha[16], left[16];
+    F* const gradients[4] = {{g0, g1, g2, g3}};
+    F* const values[4] = {{o0, o1, o2, o3}};
+    F* const left_planes[1] = {{left}};
+    F* const alpha_planes[1] = {{on_alpha}};
+    read_image(g_image.data, count, gradients);
+    read_image(image.data, count, values);
+    read_image(transmittance.data, 1, left_planes);
+    if (g_alphas.data) read_image(g_alphas.data, 1, alpha_planes);
+    for (int k = 0; k < 16; ++k) {{
+        if (!g_alphas.data) on_alpha[k] = zero;
+        R[k] = zero;
+        for (int i = 0; i < 4; ++i) {{
+            if (i >= count) {{
+                gradients[i][k] = zero;
+                continue;
+            }}
+            R[k] = fma(values[i][k], gradients[i][k], R[k]);
+            if (i == divided) {{
+                // An expected depth s / alpha counts as s with a gradient at alpha of its own.
+                const F alpha = __builtin_elementwise_max(one - left[k], (F)1e-10f);
+                gradients[i][k] /= alpha;
+                on_alpha[k] -= alpha > 1e-10f ? gradients[i][k] * values[i][k] : zero;
+            }}
         }}
+        R[k] = fma(-left[k], on_alpha[k], R[k]);
     }}
-
 {BATCH_STATE}
     const int end = stops.data[tile];
     const int WIDTH = {RECORD};
