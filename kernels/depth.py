@@ -85,13 +85,13 @@ _FORWARD = f"""
         lanes = stop - x < LANES ? stop - x : LANES;
         float* const out = normals + 3 * x;
         if (y == 0 || y == height - 1) {{
-            for (int i = 0; i < 3; ++i) store(out + i, 3, zero);
+            const F nothing[3] = {{zero, zero, zero}};
+            store3(out, nothing);
             continue;
         }}
 {_NORMAL}
-        store(out, 3, select(seen, n0, zero));
-        store(out + 1, 3, select(seen, n1, zero));
-        store(out + 2, 3, select(seen, n2, zero));
+        const F normal[3] = {{select(seen, n0, zero), select(seen, n1, zero), select(seen, n2, zero)}};
+        store3(out, normal);
     }}
 """
 
@@ -110,8 +110,9 @@ _BACKWARD = f"""
             continue;
         }}
 {_NORMAL}
-        const F g0 = load(gradients + 3 * x, 3), g1 = load(gradients + 3 * x + 1, 3),
-            g2 = load(gradients + 3 * x + 2, 3);
+        F g[3];
+        load3(gradients + 3 * x, g);
+        const F g0 = g[0], g1 = g[1], g2 = g[2];
         const F along_n = g0 * n0 + g1 * n1 + g2 * n2;
         const F h0 = (g0 - along_n * n0) * inverse, h1 = (g1 - along_n * n1) * inverse,
             h2 = (g2 - along_n * n2) * inverse;

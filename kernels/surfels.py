@@ -79,7 +79,13 @@ SURFEL = f"""
     // Tangents a, b in camera space; z times their images' directions at the centre, pixels.
     const int scale_stride = scales.shape[1];
     const float* const scale = scales.data + (size_t)n * scale_stride;
-    const F s0 = load(scale, scale_stride), s1 = load(scale + 1, scale_stride);
+    F deviations[3];
+    if (scale_stride == 3) {{
+        load3(scale, deviations);
+    }} else {{
+        deviations[0] = load(scale, scale_stride), deviations[1] = load(scale + 1, scale_stride);
+    }}
+    const F s0 = deviations[0], s1 = deviations[1];
     const F ax = r00 * q00 + r01 * q10 + r02 * q20, ay = r10 * q00 + r11 * q10 + r12 * q20,
         az = r20 * q00 + r21 * q10 + r22 * q20;
     const F bx = r00 * q01 + r01 * q11 + r02 * q21, by = r10 * q01 + r11 * q11 + r12 * q21,

@@ -104,9 +104,12 @@ _BACKWARD = f"""
         g_s0 += 2.0f * s0 * az * ha, g_s1 += 2.0f * s1 * bz * hb;
         gz += 2.0f * z * g_ahead;
         float* const g_scale = g_scales_out.data + (size_t)n * scale_stride;
-        write(g_scale, scale_stride, g_s0);
-        write(g_scale + 1, scale_stride, g_s1);
-        for (int i = 2; i < scale_stride; ++i) write(g_scale + i, scale_stride, zero);
+        if (scale_stride == 3) {{
+            write3(g_scale, g_s0, g_s1, zero);
+        }} else {{
+            write(g_scale, scale_stride, g_s0);
+            write(g_scale + 1, scale_stride, g_s1);
+        }}
 
         // -> tangents, offset and intrinsics.
         const F gax = fx * g_iax, gay = skew * g_iax + fy * g_iay,
@@ -132,11 +135,7 @@ _BACKWARD = f"""
             gq21 = r02 * gbx + r12 * gby + r22 * gbz;
         const F gq02 = side * g[{NORMAL}], gq12 = side * g[{NORMAL + 1}], gq22 = side * g[{NORMAL + 2}];
 {QUATERNION_GRADIENT}
-        float* const g_quat = (float*)(g_quats_out.data + n);
-        write(g_quat, 4, g_qw);
-        write(g_quat + 1, 4, g_qx);
-        write(g_quat + 2, 4, g_qy);
-        write(g_quat + 3, 4, g_qz);
+        write4((float*)(g_quats_out.data + n), g_qw, g_qx, g_qy, g_qz);
 {MEAN_GRADIENT}{CAMERA_GRADIENT}
     }}
 """

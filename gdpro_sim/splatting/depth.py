@@ -9,6 +9,7 @@ import warp as wp
 
 from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.kernels import depth as kernels
+from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.images import check_images
 from gdpro_sim.splatting.projection import array
 
@@ -73,7 +74,7 @@ class _Normals(torch.autograd.Function):
     def forward(  # type: ignore[override]
         ctx: Any, depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor
     ) -> torch.Tensor:
-        normals = depth.new_empty((*depth.shape[:3], 3))
+        normals = buffers.empty((*depth.shape[:3], 3), depth.dtype, depth.device)
         inputs, indices = _spans(depth, viewmats, Ks)
         outputs = [array(normals.view(-1), wp.float32)]
         with torch_stream(depth):
@@ -88,9 +89,9 @@ class _Normals(torch.autograd.Function):
         depth, viewmats, Ks = ctx.saved_tensors
         inputs, indices = _spans(depth, viewmats, Ks)
         with_cameras = ctx.needs_input_grad[1] or ctx.needs_input_grad[2]
-        g_ratios = depth.new_empty((2, depth.numel()))
+        g_ratios = buffers.empty((2, depth.numel()), depth.dtype, depth.device)
         g_cameras = depth.new_empty((indices if with_cameras else 0, kernels.CAMERA_GRADIENTS))
-        g_depth = torch.empty_like(depth)
+        g_depth = buffers.empty_like(depth)
         device = device_name(depth)
         with torch_stream(depth):
             given = array(gradients[0].contiguous().view(-1), wp.float32)

@@ -14,6 +14,7 @@ from gdpro_sim.kernels import surfel_compositing_backward
 from gdpro_sim.kernels.projection import TILE
 from gdpro_sim.kernels.surfel_compositing_backward import ABSOLUTE
 from gdpro_sim.kernels.surfels import CHANNELS, MEAN, RECORD
+from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.projection import View, array
 from gdpro_sim.splatting.slabs import add_over_tiles, balanced_slabs
 from gdpro_sim.splatting.surfel_projection import SurfelProjection
@@ -139,13 +140,14 @@ class _Blend(torch.autograd.Function):
         cameras = len(backgrounds)
         tiles = cameras * rows * columns
         pixels = cameras * view.height * view.width
-        image = backgrounds.new_empty((pixels, blending.colours + blending.depth))
-        alphas, transmittance = backgrounds.new_empty((2, pixels)).unbind(0)
+        like = backgrounds.dtype, backgrounds.device
+        image = buffers.empty((pixels, blending.colours + blending.depth), *like)
+        alphas, transmittance = buffers.empty((pixels,), *like), buffers.empty((pixels,), *like)
         stops = torch.empty(tiles if blending.tile else pixels, dtype=torch.int32, device=records.device)
         shown = pixels if blending.geometry else 0
-        depths, distortion, medians = backgrounds.new_empty((3, shown)).unbind(0)
-        normals = backgrounds.new_empty((shown, 3))
-        medians_at = torch.empty(shown, dtype=torch.int32, device=records.device)
+        depths, distortion, medians = (buffers.empty((shown,), *like) for _ in range(3))
+        normals = buffers.empty((shown, 3), *like)
+        medians_at = buffers.empty((shown,), torch.int32, records.device)
         inputs = [
             *_sources(records, channels, lists),
             array(backgrounds, wp.float32),
@@ -269,7 +271,7 @@ def gradient_sums(
                 device="cpu",
             )
 
-        return add_over_tiles(launch, surfel_compositing_backward, lists, stops, rects, view, RECORD)
+        return add_over_tiles(launch, surfel_compositing_backward, lists, stops, rects, RECORD)
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.
     wp.launch(

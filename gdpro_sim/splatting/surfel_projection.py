@@ -13,6 +13,7 @@ from gdpro_sim.kernels import surfels as kernels
 from gdpro_sim.kernels import surfels_backward
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.kernels.projection_backward import CAMERA_GRADIENTS
+from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.projection import Projection, View, array, camera_gradients, lanes_of, sort_pairs
 
 
@@ -71,11 +72,11 @@ class _Project(torch.autograd.Function):
     ) -> tuple[torch.Tensor, ...]:
         cameras, count = len(viewmats), len(means)
         total = cameras * count
-        records = means.new_empty((total, kernels.RECORD))
-        radii = means.new_empty((total, 2), dtype=torch.int32)
-        rects = means.new_empty((total, 4), dtype=torch.int16)
-        keys = means.new_empty((cameras, 2 * count))
-        order = means.new_empty((cameras, 2 * count), dtype=torch.int32)
+        records = buffers.empty((total, kernels.RECORD), means.dtype, means.device)
+        radii = buffers.empty((total, 2), torch.int32, means.device)
+        rects = buffers.empty((total, 4), torch.int16, means.device)
+        keys = buffers.empty((cameras, 2 * count), torch.float32, means.device)
+        order = buffers.empty((cameras, 2 * count), torch.int32, means.device)
         lanes = lanes_of(means)
         launch_chunked(
             kernels.project_surfels,
@@ -127,11 +128,13 @@ class _Project(torch.autograd.Function):
             g_records = means.new_zeros((total, kernels.RECORD))
         if g_means2d is None:
             g_means2d = means.new_zeros((total, 2))
-        g_means, g_quats = torch.empty_like(means), torch.empty_like(quats)
-        g_scales, g_opacities = torch.empty_like(scales), torch.empty_like(opacities)
+        g_means, g_quats = buffers.empty_like(means), buffers.empty_like(quats)
+        g_scales, g_opacities = buffers.empty_like(scales), buffers.empty_like(opacities)
         whole = ctx.degree is None or (ctx.degree + 1) ** 2 == sh.shape[1]
-        g_sh = torch.empty_like(sh) if whole else torch.zeros_like(sh)
-        g_features = torch.empty_like(features) if features.shape[1] <= 3 else torch.zeros_like(features)
+        g_sh = buffers.empty_like(sh) if whole else buffers.empty_like(sh).zero_()
+        g_features = buffers.empty_like(features)
+        if features.shape[1] > 3:
+            g_features.zero_()
         with_cameras = bool(ctx.needs_input_grad[6] or ctx.needs_input_grad[7])
         lanes = lanes_of(means)
         groups = -(-len(means) // lanes)
