@@ -30,61 +30,23 @@ IN_SLAB = """
 """Snippet: whether a Gaussian touches tiles of the slab alone."""
 
 
-@wp.func_native(f"""
-{IN_SLAB}
-    int spills = 0;
-    for (int at = begin; at < end; ++at) spills += in_slab(ids.data[at]) ? 0 : 1;
-    return spills;
-""")
-def spills_of(
-    begin: int,
-    end: int,
-    ids: wp.array[int],
-    rects: wp.array[vec4s],
-    camera: int,
-    tiles_x: int,
-    tiles_y: int,
-    slab_begin: int,
-    slab_end: int,
-) -> int: ...
-
-
-@wp.kernel
-def count_spills(
-    start: int,
-    # In:
-    offsets: wp.array[int],
-    stops: wp.array[int],
-    ids: wp.array[int],
-    rects: wp.array[vec4s],
-    tiles_x: int,
-    tiles_y: int,
-    slab_begin: int,
-    slab_end: int,
-    # Out:
-    counts_out: wp.array[int],
-):
-    """How many entries before its stop each tile of the slab may spill."""
-    tile = start + wp.tid()
-    camera = tile / (tiles_x * tiles_y)
-    counts_out[tile] = spills_of(
-        offsets[tile], stops[tile], ids, rects, camera, tiles_x, tiles_y, slab_begin, slab_end
-    )
-
-
 @wp.func_native("""
-    for (int i = 0; i < spill_ids.shape[0]; ++i) {
-        const int g = spill_ids.data[i];
-        if (g < 0 || g % parts != part) continue;
-        float* const sum = sums_out.data + (size_t)g * width;
-        const float* const spill = spills.data + (size_t)i * width;
-        for (int j = 0; j < width; ++j) sum[j] += spill[j];
+    for (int tile = 0; tile + 1 < offsets.shape[0]; ++tile) {
+        for (int i = offsets.data[tile]; i < offsets.data[tile + 1]; ++i) {
+            const int g = spill_ids.data[i];
+            if (g < 0) break;
+            if (g % parts != part) continue;
+            float* const sum = sums_out.data + (size_t)g * width;
+            const float* const spill = spills.data + (size_t)i * width;
+            for (int j = 0; j < width; ++j) sum[j] += spill[j];
+        }
     }
 """)
 def merge_part(
     part: int,
     parts: int,
     width: int,
+    offsets: wp.array[int],
     spill_ids: wp.array[int],
     spills: wp.array2d[float],
     sums_out: wp.array2d[float],
@@ -96,10 +58,14 @@ def merge_spills(
     start: int,
     # In:
     parts: int,
+    offsets: wp.array[int],
     spill_ids: wp.array[int],
     spills: wp.array2d[float],
     # Out:
     sums_out: wp.array2d[float],
 ):
-    """Add the spills, in order, of the Gaussians whose number is `part` modulo `parts`."""
-    merge_part(start + wp.tid(), parts, spills.shape[1], spill_ids, spills, sums_out)
+    """Add the spills, in order, of the Gaussians whose number is `part` modulo `parts`.
+
+    Those of tile t lie from offsets[t] on, with their Gaussians in `spill_ids`, and end before the first -1.
+    """
+    merge_part(start + wp.tid(), parts, spills.shape[1], offsets, spill_ids, spills, sums_out)

@@ -237,7 +237,7 @@ def gradient_sums(
             )
 
         width = int(RECORD)
-        return add_over_tiles(launch, compositing_backward, lists, stops, rects, view, width)
+        return add_over_tiles(launch, compositing_backward, lists, stops, rects, width)
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.
     wp.launch(
