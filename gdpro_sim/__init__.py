@@ -24,6 +24,7 @@ _PUBLIC = {
     "import_mesh": "gdpro_sim.asset",
     "load_scene": "gdpro_sim.simulation.scene",
     "rasterization": "gdpro_sim.splatting",
+    "rasterization_2dgs": "gdpro_sim.splatting",
     "record": "gdpro_sim.io.record",
     "simulate": "gdpro_sim.simulation.run",
 }
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from gdpro_sim.simulation.frame import Frame
     from gdpro_sim.simulation.run import Simulation, simulate
     from gdpro_sim.simulation.scene import Scene, load_scene
-    from gdpro_sim.splatting import RasterOptions, rasterization
+    from gdpro_sim.splatting import RasterOptions, rasterization, rasterization_2dgs
 
 
 def __getattr__(name: str) -> Any:
@@ -68,6 +69,7 @@ __all__ = [
     "import_mesh",
     "load_scene",
     "rasterization",
+    "rasterization_2dgs",
     "record",
     "simulate",
 ]

@@ -155,7 +155,7 @@ BATCH = f"""
             *(F*)(w0 + first) = w;
             *(F*)(mx0 + first) = mx;
             *(F*)(my0 + first) = my;
-            const F turn = 1.5f * (abs_(w_x) + abs_(w_y));
+            const F turn = 1.5f * (abs_(w_x) + abs_(w_y)), doubtful = 2.02f * turn + 1.0e-3f;
             const F blur = fields[{BLUR}] + 1.5f;
             const F corner_u = u_x + u_y, corner_v = v_x + v_y, other_u = u_x - u_y, other_v = v_x - v_y;
             const F reach = {1.5 * float(SLACK)!r}f * __builtin_elementwise_sqrt(max_(
@@ -179,17 +179,16 @@ BATCH = f"""
                 const F cu = across_u[k & 3] + down_u[k >> 2], cv = across_v[k & 3] + down_v[k >> 2];
                 const F widest = across_w[k & 3] + down_w[k >> 2];
                 const F limit = fma(fields[{EXTENT}], widest, reach);
-                const I low = in_x[k & 3] & in_y[k >> 2] & blur_x[k & 3] & blur_y[k >> 2];
-                const I disc = in_x[k & 3] & in_y[k >> 2] & (widest > zero) & (fma(cu, cu,
-                    cv * cv) <= limit * limit);
+                const I touched = in_x[k & 3] & in_y[k >> 2];
+                const I disc = touched & (widest > zero) & (fma(cu, cu, cv * cv) <= limit * limit);
+                const I low = (touched & blur_x[k & 3] & blur_y[k >> 2]) | (disc & (widest < doubtful));
                 {{each}}
             }}
             {{end}}
         }}
 """
-"""CPU snippet: list from `at` on -> `held` entries in `rows`, u0 .. my0;
-{{each}} takes the masks of the 16 entries
-from `first` on of which the disc or the low-pass may reach block k, between {{declare}} and {{end}}."""
+"""CPU snippet: list from `at` on -> `held` entries in `rows`, u0 .. my0; {each}, between {declare} and {end},
+takes masks of the 16 entries from `first` on: whose `disc` may reach block k, and which need HIT there, `low`."""
 
 RAY = f"""
             const float* const r = rows[i];
@@ -217,40 +216,37 @@ PIXEL_RAY = f"""
 """Snippet for one pixel: entry `at` -> the same."""
 
 _HIT = """
-            const F inverse = reciprocal(max_(wn, nearest));
             const F u = un * inverse, v = vn * inverse;
             const F disc = fma(u, u, v * v);
 """
 
-HIT_DISC = f"""{_HIT}
-            const I hit = wn > nearest;
+HIT_DISC = f"""
+            const F inverse = reciprocal(wn);
+{_HIT}
             const F p = l - disc;
             const F scale = inverse;
 """
-"""Snippet: un = U . e, vn, wn -> p = log2(alpha) where hit, scale = z / DEPTH; far from the low-pass."""
+"""Snippet: un = U . e, vn, wn -> p = log2(alpha), scale = z / DEPTH, where the disc is sure to be hit."""
 
-HIT = f"""{_HIT}
+HIT = f"""
+            const F inverse = reciprocal(max_(wn, nearest));
+{_HIT}
             const F low = log2_e * fma(dx, dx, dy * dy);
             const I hit = (wn > nearest) & (disc <= low);
             const F p = l - (hit ? disc : low);
             const F scale = hit ? inverse : one;
 """
-"""The same with the low-pass; dx, dy from the mean."""
+"""The same with the low-pass, and where the disc is not hit; dx, dy from the mean."""
 
-_WEIGH = """
+WEIGH = """
+            const I seen = p >= cutoff;
             const F alpha = min_(raw, alpha_max);
             const F next = fma(-alpha, t, t);
             const I blend = seen & (next > transmittance_min);
             const F w = blend ? alpha * t : zero;
             const F z = depth * scale;
 """
-WEIGH_DISC = f"""
-            const I seen = hit & (p >= cutoff);
-{_WEIGH}"""
-WEIGH = f"""
-            const I seen = p >= cutoff;
-{_WEIGH}"""
-"""Snippets: raw alpha and transmittance t -> weight w of what blends, and depth z."""
+"""Snippet: raw alpha and transmittance t -> weight w of what blends, and depth z."""
 
 _ADD = f"""
             c0 = fma(w, (F)c[0], c0);
@@ -262,12 +258,14 @@ _ADD = f"""
                 n2 = fma(w, (F)r[{NORMAL + 2}], n2);
                 bend = fma(w, fma(z, one - t, -D), bend);
                 D = fma(w, z, D);
-                const I middle = blend & (t > one_half);
-                median = middle ? z : median;
-                median_at = middle ? (I)number : median_at;
+                if (open) {{
+                    const I middle = blend & (t > one_half);
+                    median = middle ? z : median;
+                    median_at = middle ? (I)number : median_at;
+                }}
             }}
 """
-"""Snippet: adds weight w of entry `number` of the list."""
+"""Snippet: adds weight w of entry `number` of the list; `open` where T > 1/2 anywhere."""
 
 _WRITE = """
             // Over the background; an expected depth is divided by alpha.
@@ -337,6 +335,7 @@ _TILE = f"""
             const F x = X[k], y = Y[k];
             F t = T[k], {", ".join(f"{name} = {name}_[k]" for name in _SUMS)};
             I median_at = median_at_[k];
+            const bool open = bits(t > one_half) != 0;
             do {{
                 const int i = __builtin_ctz(left), number = at + i;
                 left &= left - 1;
@@ -344,7 +343,7 @@ _TILE = f"""
                 if (blurred[k] >> i & 1) {{
 {LOW}{HIT}{EXP2}{WEIGH}{_ADD}{PASS}
                 }} else {{
-{HIT_DISC}{EXP2}{WEIGH_DISC}{_ADD}{PASS}
+{HIT_DISC}{EXP2}{WEIGH}{_ADD}{PASS}
                 }}
             }} while (left);
             T[k] = t, {", ".join(f"{name}_[k] = {name}" for name in _SUMS)}, median_at_[k] = median_at;
@@ -393,6 +392,7 @@ _PIXEL = f"""
 {SCALAR}
     F t = one, {", ".join(f"{name} = zero" for name in _SUMS)};
     I median_at = -1;
+    const bool open = true;
     const int channels_out = image_out.shape[1];
     const int end = offsets.data[tile + 1];
     int last = begin;

@@ -32,7 +32,6 @@ from gdpro_sim.kernels.surfel_compositing import (
     SCALAR,
     VECTOR,
     WEIGH,
-    WEIGH_DISC,
 )
 from gdpro_sim.kernels.surfel_images import IMAGES
 from gdpro_sim.kernels.surfels import (
@@ -282,7 +281,7 @@ _TILE = f"""
                 mask &= mask - 1;
                 const F x = X[k], y = Y[k], at_x = x, at_y = y;
                 F t = T[k];
-{RAY}{HIT_DISC}{EXP2}{WEIGH_DISC}{_GRADIENT}{_CHAIN}{_ADD_DISC}{PASS}
+{RAY}{HIT_DISC}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN}{_ADD_DISC}{PASS}
                 T[k] = t;
                 if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
             }}

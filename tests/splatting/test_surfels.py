@@ -15,6 +15,7 @@ from gdpro_sim import device
 from gdpro_sim.errors import RequestError
 from gdpro_sim.splatting import RasterOptions, contributions, rasterization_2dgs
 from gdpro_sim.splatting.depth import depth_to_normals
+from tests.conditions import needs_gpu
 from tests.splatting.scenes import cameras, cloud, features, frontal, harmonics
 
 SIZE = 64
@@ -357,6 +358,30 @@ def test_methods_agree(mode: str) -> None:
         assert error.median() < 1e-7
         assert (error > 1e-5).float().mean() < 1e-3
     assert torch.equal(images[0][6]["flatten_ids"], images[1][6]["flatten_ids"])
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
+@pytest.mark.parametrize("degree", [None, 3])
+def test_cuda_equals_cpu(mode: str, degree: int | None) -> None:
+    scene, views = cloud(2000, 0, size=0.06), cameras(2, 200, 150)
+    scene["colors"] = features(2000, 5, 0) if degree is None else harmonics(2000, degree, 0)
+    found = []
+    for where in ("cpu", "cuda"):
+        given_ = {k: v.to(where).requires_grad_() for k, v in scene.items()}
+        moved = {k: v.to(where) if isinstance(v, Tensor) else v for k, v in views.items()}
+        outputs = rasterization_2dgs(**given_, **moved, sh_degree=degree, render_mode=mode)
+        images = [image for image in outputs[:6] if image is not None]
+        loss = sum((image * image).mean() for image in images)
+        gradients = torch.autograd.grad(loss, list(given_.values()))
+        found.append([[t.detach().cpu() for t in images], [t.cpu() for t in gradients]])
+    # Rounding differs, so a few pixels at a threshold may move by 1/255.
+    for cpu, cuda in zip(found[0][0], found[1][0], strict=True):
+        assert ((cuda - cpu).abs() > 1e-3).float().mean() < 2e-3
+        assert (cuda - cpu).abs().median() < 1e-6
+    for cpu, cuda in zip(found[0][1], found[1][1], strict=True):
+        assert (cuda - cpu).norm() < 2e-2 * cpu.norm()
 
 
 def call(**changes: object) -> None:
