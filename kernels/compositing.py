@@ -16,7 +16,6 @@ Up to four channels are blended at once; more channels run again over the same l
 import warp as wp
 
 from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
-from gdpro_sim.kernels.surfel_images import IMAGES
 from gdpro_sim.kernels.projection import (
     BOX,
     CHANNELS,
@@ -28,6 +27,7 @@ from gdpro_sim.kernels.projection import (
     RECORD,
     TILE,
 )
+from gdpro_sim.kernels.surfel_images import IMAGES
 
 wp.set_module_options(
     {
@@ -82,13 +82,15 @@ TILE_LANES = f"""
 
     // Read through volatile memory so that they stay in registers: as literals the compiler would fetch each
     // anew at every block, through a 64-bit address.
-    const volatile float literals[] = {{12582912.0f, 1.3264727e-3f, 9.671513e-3f, 5.5507336e-2f, 2.4022242e-1f,
+    const volatile float literals[] = {{12582912.0f, 1.3264727e-3f, 9.671513e-3f, 5.5507336e-2f,
+        2.4022242e-1f,
         6.9314700e-1f, 1.0f, {float(ALPHA_MAX)!r}f, {float(LOG2_CUTOFF)!r}f, {float(TRANSMITTANCE_MIN)!r}f}};
     const F magic = (F)literals[0], e5 = (F)literals[1], e4 = (F)literals[2], e3 = (F)literals[3],
         e2 = (F)literals[4], e1 = (F)literals[5], one = (F)literals[6], alpha_max = (F)literals[7],
         cutoff = (F)literals[8], transmittance_min = (F)literals[9];
 
-    // Transmittance of the pixels of 16 blocks, with the sign as a flag: T > 0 goes on, T < 0 has stopped at |T|.
+    // Transmittance of the pixels of 16 blocks, with the sign as a flag: T > 0 goes on, T < 0 has stopped
+    // at |T|.
     F T[16], X[16], Y[16];
     unsigned alive = 0;
     for (int k = 0; k < 16; ++k) {{
@@ -102,8 +104,8 @@ TILE_LANES = f"""
 """CPU snippet: 16 pixel lanes, 16 blocks of 4 x 4 pixels in a tile, at X, Y; `alive` has a bit per block."""
 
 EXP2 = """
-            // exp2(p): p = n + f with |f| <= 1/2 through the 1.5 * 2^23 trick, then a degree-5 minimax polynomial
-            // in f (relative error 2e-7) to whose exponent field n is added.
+            // exp2(p): p = n + f with |f| <= 1/2 through the 1.5 * 2^23 trick, then a degree-5 minimax
+            // polynomial in f (relative error 2e-7) to whose exponent field n is added.
             const F n = p + magic;
             const F f = p - (n - magic);
             F e = fma(f, e5, e4);
@@ -149,9 +151,10 @@ BATCH_STATE = f"""
 """CPU snippet: what BATCH needs."""
 
 BATCH = f"""
-        // The next entries of the list, copied to `rows`, 16 at a time side by side in lanes: offset of the tile's
-        // first pixel from the mean, in pixels and whitened, and the blocks each can reach: those whose centre
-        // lies in the box grown by the block, and within `reach` of the mean in standard deviations.
+        // The next entries of the list, copied to `rows`, 16 at a time side by side in lanes: offset of
+        // the tile's first pixel from the mean, in pixels and whitened, and the blocks each can reach:
+        // those whose centre lies in the box grown by the block, and within `reach` of the mean in
+        // standard deviations.
         const int held = end - at < {BATCH_SIZE} ? end - at : {BATCH_SIZE};
         for (int first = 0; first < held; first += 16) {{
             F fields[{RECORD}];
@@ -160,7 +163,8 @@ BATCH = f"""
                 __builtin_memcpy(&fields[j], record + (size_t)id[at + i] * {RECORD}, 64);
                 *(F*)rows[first + j] = fields[j];
                 if (!own_channels) {{
-                    __builtin_memcpy(rows[first + j] + {CHANNELS}, colour + (size_t)id[at + i] * channel_stride, 16);
+                    __builtin_memcpy(rows[first + j] + {CHANNELS},
+                        colour + (size_t)id[at + i] * channel_stride, 16);
                 }}
                 if (i + {BATCH_SIZE} < end - at) {{
                     __builtin_prefetch(record + (size_t)id[at + i + {BATCH_SIZE}] * {RECORD});
@@ -168,7 +172,8 @@ BATCH = f"""
             }}
             transpose(fields);
             const F a = fields[{FACTOR}], b = fields[{FACTOR + 1}], d = fields[{FACTOR + 2}];
-            const F dx = (float)tile_x + 0.5f - fields[{MEAN}], dy = (float)tile_y + 0.5f - fields[{MEAN + 1}];
+            const F dx = (float)tile_x + 0.5f - fields[{MEAN}],
+                dy = (float)tile_y + 0.5f - fields[{MEAN + 1}];
             *(F*)(u0 + first) = fma(a, dx, b * dy);
             *(F*)(v0 + first) = d * dy;
             const F reach_x = fields[{BOX}] + 1.5f, reach_y = fields[{BOX + 1}] + 1.5f;
@@ -192,8 +197,8 @@ BATCH = f"""
             {{end}}
         }}
 """
-"""CPU snippet: list from `at` on -> `held` entries in `rows`, u0, v0; {{each}} takes the mask `hit` of the 16 entries
-from `first` on that reach block k, between {{declare}} and {{end}}."""
+"""CPU snippet: list from `at` on -> `held` entries in `rows`, u0, v0; {each} takes the mask `hit` of the 16
+entries from `first` on that reach block k, between {declare} and {end}."""
 
 POWER = f"""
             const float* const r = rows[i];

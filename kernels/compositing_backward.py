@@ -27,7 +27,6 @@ from gdpro_sim.kernels.compositing import (
     POWER,
     TILE_LANES,
 )
-from gdpro_sim.kernels.surfel_images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
 from gdpro_sim.kernels.projection import (
     BOX,
@@ -40,6 +39,7 @@ from gdpro_sim.kernels.projection import (
     vec4s,
 )
 from gdpro_sim.kernels.slabs import IN_SLAB
+from gdpro_sim.kernels.surfel_images import IMAGES
 
 wp.set_module_options(
     {
@@ -148,7 +148,8 @@ _TILE = f"""
                 const F x = X[k], y = Y[k];
                 F t = T[k];
 {POWER}{EXP2}{BLEND}
-                F q = fma((F)r[{CHANNELS}], g0[k], fma((F)r[{CHANNELS + 1}], g1[k], r[{CHANNELS + 2}] * g2[k]));
+                F q = fma((F)r[{CHANNELS}], g0[k], fma((F)r[{CHANNELS + 1}], g1[k],
+                    r[{CHANNELS + 2}] * g2[k]));
                 if (count > 3) q = fma((F)r[{CHANNELS + 3}], g3[k], q);
                 const F behind = fma(-w, q, R[k]);
                 R[k] = behind;
@@ -174,7 +175,8 @@ _TILE = f"""
                 if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
             }} while (mask);
 {SPILL}
-            // p = l - u^2 - v^2, u = a dx + b dy, v = d dy, with dx, dy from the mean: X, Y plus those of the tile.
+            // p = l - u^2 - v^2, u = a dx + b dy, v = d dy, with dx, dy from the mean: X, Y plus those of
+            // the tile.
             const float* const r = rows[i];
             const float dx = (float)tile_x + 0.5f - r[{MEAN}], dy = (float)tile_y + 0.5f - r[{MEAN + 1}];
             const F sums[16] = {{

@@ -42,7 +42,8 @@ def harmonics_sum(sh: wp.array2d[wp.vec3], i: int, degree: int, direction: wp.ve
 
 HARMONICS = f"""
     // Unit direction from the camera, for a rigid view matrix: R^T (R mean + t), normalized.
-    const F vx = r00 * x + r10 * y + r20 * z, vy = r01 * x + r11 * y + r21 * z, vz = r02 * x + r12 * y + r22 * z;
+    const F vx = r00 * x + r10 * y + r20 * z, vy = r01 * x + r11 * y + r21 * z,
+        vz = r02 * x + r12 * y + r22 * z;
     const F distance = sqrt_(vx * vx + vy * vy + vz * vz);
     const F ux = vx / distance, uy = vy / distance, uz = vz / distance;
     const F uxx = ux * ux, uyy = uy * uy, uzz = uz * uz;
@@ -108,7 +109,8 @@ HARMONICS_GRADIENT = f"""
     }}
     if (degree >= 2) {{
         const F a4 = {float(C2_0)!r}f * along[4], a5 = {float(C2_0)!r}f * along[5];
-        const F a6 = {2 * C2_1!r}f * along[6], a7 = {float(C2_0)!r}f * along[7], a8 = {2 * C2_2!r}f * along[8];
+        const F a6 = {2 * C2_1!r}f * along[6], a7 = {float(C2_0)!r}f * along[7],
+            a8 = {2 * C2_2!r}f * along[8];
         gux += uy * a4 - ux * a6 - uz * a7 + ux * a8;
         guy += ux * a4 - uz * a5 - uy * a6 - uy * a8;
         guz += 2.0f * uz * a6 - uy * a5 - ux * a7;

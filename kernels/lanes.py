@@ -1,6 +1,7 @@
 """C++ text shared by the native snippets of the splatting kernels: vectors of pixel or Gaussian lanes.
 
-`PRELUDE` opens a snippet. It defines a float vector `F` and an int vector `I` of `LANES` lanes, 16 on a CPU and
+`PRELUDE` opens a snippet. It defines a float vector `F` and an int vector `I` of `LANES` lanes,
+    16 on a CPU and
 one on a GPU, and the functions below, so that the same text works on 16 Gaussians at once on a CPU and on one
 per thread on a GPU. The snippet must declare `const int lanes` before: how many of the lanes hold something.
 
@@ -34,7 +35,7 @@ CPU_FLAGS = "-march=native" + (" -mprefer-vector-width=512" if X86 else "")
 
 
 def _shuffles(half: int) -> tuple[str, str]:
-    """Lane numbers that interleave two vectors: where bit `half` of the lane is clear the first's, else the second's."""
+    """Lane numbers that interleave two vectors: the first's where bit `half` of the lane is clear."""
     low = [j if not j & half else 16 + j - half for j in range(16)]
     high = [j + half if not j & half else 16 + j for j in range(16)]
     return ", ".join(map(str, low)), ", ".join(map(str, high))
@@ -169,7 +170,8 @@ PRELUDE = (
     + """
     };
     auto load_rows = [&](const float* p, int stride, F* rows) {
-        for (int j = 0; j < 16; ++j) __builtin_memcpy(&rows[j], p + (j < lanes ? j : lanes - 1) * (size_t)stride, 64);
+        for (int j = 0; j < 16; ++j) __builtin_memcpy(&rows[j],
+            p + (j < lanes ? j : lanes - 1) * (size_t)stride, 64);
         transpose(rows);
     };
     auto store_rows = [&](float* p, int stride, F* rows) {

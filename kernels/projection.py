@@ -102,8 +102,8 @@ PINHOLE = """
 """Snippet: pixel offsets from the principal point."""
 
 COVARIANCE = """
-    // Perspective is linearized at the mean, pulled to at most 0.15 image sizes outside the image: farther out
-    // the linearization would blow Gaussians up (as in the code of 3D Gaussian Splatting).
+    // Perspective is linearized at the mean, pulled to at most 0.15 image sizes outside the image: farther
+    // out the linearization would blow Gaussians up (as in the code of 3D Gaussian Splatting).
     const float low_x = -cx - 0.15f * (float)width, high_x = (float)width - cx + 0.15f * (float)width;
     const float low_y = -cy - 0.15f * (float)height, high_y = (float)height - cy + 0.15f * (float)height;
     const F pulled_x = min_(max_(offset_x, splat(low_x)), splat(high_x));
@@ -158,7 +158,8 @@ BIN = f"""
     const I radius_x = to_int(select(drawn, min_(ceil_(box_x), largest), zero));
     const I radius_y = to_int(select(drawn, min_(ceil_(box_y), largest), zero));
     const F tile = splat({1 / TILE!r}f);
-    const I begin_x = to_int(select(drawn, x0 * tile, zero)), begin_y = to_int(select(drawn, y0 * tile, zero));
+    const I begin_x = to_int(select(drawn, x0 * tile, zero)), begin_y = to_int(select(drawn, y0 * tile,
+        zero));
     const I end_x = to_int(select(drawn, x1 * tile + 1.0f, zero));
     const I end_y = to_int(select(drawn, y1 * tile + 1.0f, zero));
     const F key = select(drawn, z, splat(1.0f / 0.0f));

@@ -40,9 +40,12 @@ LN2 = 0.6931471805599453
 QUATERNION_GRADIENT = """
     // Gradient gqij of the rotation matrix -> of the quaternion before normalization.
     const F gw1 = 2.0f * (qx * (gq21 - gq12) + qy * (gq02 - gq20) + qz * (gq10 - gq01));
-    const F gx1 = 2.0f * (qy * (gq01 + gq10) + qz * (gq02 + gq20) + qw * (gq21 - gq12) - 2.0f * qx * (gq11 + gq22));
-    const F gy1 = 2.0f * (qx * (gq01 + gq10) + qz * (gq12 + gq21) + qw * (gq02 - gq20) - 2.0f * qy * (gq00 + gq22));
-    const F gz1 = 2.0f * (qx * (gq02 + gq20) + qy * (gq12 + gq21) + qw * (gq10 - gq01) - 2.0f * qz * (gq00 + gq11));
+    const F gx1 = 2.0f * (qy * (gq01 + gq10) + qz * (gq02 + gq20) + qw * (gq21 - gq12)
+        - 2.0f * qx * (gq11 + gq22));
+    const F gy1 = 2.0f * (qx * (gq01 + gq10) + qz * (gq12 + gq21) + qw * (gq02 - gq20)
+        - 2.0f * qy * (gq00 + gq22));
+    const F gz1 = 2.0f * (qx * (gq02 + gq20) + qy * (gq12 + gq21) + qw * (gq10 - gq01)
+        - 2.0f * qz * (gq00 + gq11));
     const F along_q = gw1 * qw + gx1 * qx + gy1 * qy + gz1 * qz;
     const F inverse_length = unit / longest;
     const F g_qw = (gw1 - along_q * qw) * inverse_length, g_qx = (gx1 - along_q * qx) * inverse_length;
@@ -79,8 +82,10 @@ MEAN_GRADIENT = """
 CAMERA_GRADIENT = """
         if (with_cameras) {
             // Sums over this run of groups, of lanes in order, so the result does not depend on the threads.
-            const F terms_[17] = {gr00 + gx * mx, gr01 + gx * my, gr02 + gx * mz, gr10 + gy * mx, gr11 + gy * my,
-                gr12 + gy * mz, gr20 + gz * mx, gr21 + gz * my, gr22 + gz * mz, gx, gy, gz, gfx, gskew, gcx, gfy, gcy};
+            const F terms_[17] = {gr00 + gx * mx, gr01 + gx * my, gr02 + gx * mz, gr10 + gy * mx,
+                gr11 + gy * my,
+                gr12 + gy * mz, gr20 + gz * mx, gr21 + gz * my, gr22 + gz * mz, gx, gy, gz, gfx, gskew,
+                    gcx, gfy, gcy};
             float* const sums = g_cameras_out.data + ((size_t)run * cameras + camera) * 17;
             for (int i = 0; i < 17; ++i) sums[i] += total(select(shown & finite(terms_[i]), terms_[i], zero));
         }
@@ -116,7 +121,8 @@ _BACKWARD = f"""
         const F g_mean_x = select(shown, load(g_means2d.data + 2 * first, 2), zero);
         const F g_mean_y = select(shown, load(g_means2d.data + 2 * first + 1, 2), zero);
         F gx = zero, gy = zero, gz = g[{DEPTH}];
-        F gr00 = zero, gr01 = zero, gr02 = zero, gr10 = zero, gr11 = zero, gr12 = zero, gr20 = zero, gr21 = zero,
+        F gr00 = zero, gr01 = zero, gr02 = zero, gr10 = zero, gr11 = zero, gr12 = zero, gr20 = zero,
+            gr21 = zero,
             gr22 = zero;
 
         // Channels.
@@ -127,7 +133,8 @@ _BACKWARD = f"""
             const F g_blue = select(shown & (blue >= 0.0f), g[{CHANNELS + 2}], zero);
             gz += g[{CHANNELS + 3}];
 {HARMONICS_GRADIENT}
-            const F wx = select(shown, gvx, zero), wy = select(shown, gvy, zero), wz = select(shown, gvz, zero);
+            const F wx = select(shown, gvx, zero), wy = select(shown, gvy, zero), wz = select(shown, gvz,
+                zero);
             gx += r00 * wx + r01 * wy + r02 * wz;
             gy += r10 * wx + r11 * wy + r12 * wz;
             gz += r20 * wx + r21 * wy + r22 * wz;
@@ -140,7 +147,8 @@ _BACKWARD = f"""
             for (int i = 0; i < 4; ++i) {{
                 if (i == channels) gz += g[{CHANNELS} + i];
                 if (i >= channels) continue;
-                if (camera == 0 || g_features_out.shape[0] > count) store(g_feature + i, channels, g[{CHANNELS} + i]);
+                if (camera == 0 || g_features_out.shape[0] > count) store(g_feature + i, channels,
+                    g[{CHANNELS} + i]);
                 else add(g_feature + i, channels, g[{CHANNELS} + i]);
             }}
         }}
@@ -173,7 +181,8 @@ _BACKWARD = f"""
             gmy2 = 2.0f * g_yy * my2 + g_xy * mx2;
         write3((float*)(g_scales_out.data + n), gmx0 * ax0 + gmy0 * ay0, gmx1 * ax1 + gmy1 * ay1,
             gmx2 * ax2 + gmy2 * ay2);
-        const F hx0 = gmx0 * s0, hx1 = gmx1 * s1, hx2 = gmx2 * s2, hy0 = gmy0 * s0, hy1 = gmy1 * s1, hy2 = gmy2 * s2;
+        const F hx0 = gmx0 * s0, hx1 = gmx1 * s1, hx2 = gmx2 * s2, hy0 = gmy0 * s0, hy1 = gmy1 * s1,
+            hy2 = gmy2 * s2;
         const F gq00 = wx0 * hx0 + wy0 * hy0, gq01 = wx0 * hx1 + wy0 * hy1, gq02 = wx0 * hx2 + wy0 * hy2;
         const F gq10 = wx1 * hx0 + wy1 * hy0, gq11 = wx1 * hx1 + wy1 * hy1, gq12 = wx1 * hx2 + wy1 * hy2;
         const F gq20 = wx2 * hx0 + wy2 * hy0, gq21 = wx2 * hx1 + wy2 * hy1, gq22 = wx2 * hx2 + wy2 * hy2;
@@ -200,7 +209,8 @@ _BACKWARD = f"""
         const F gfy = (gjy1 + goy * y) * inverse_z;
         gx += gox * fx * inverse_z;
         gy += (gox * skew + goy * fy) * inverse_z;
-        gz -= (gox * offset_x + goy * offset_y + gjx0 * jx0 + gjx1 * jx1 + gjx2 * jx2 + gjy1 * jy1 + gjy2 * jy2)
+        gz -= (gox * offset_x + goy * offset_y + gjx0 * jx0 + gjx1 * jx1 + gjx2 * jx2 + gjy1 * jy1
+            + gjy2 * jy2)
             * inverse_z;
 {MEAN_GRADIENT}{CAMERA_GRADIENT}
     }}

@@ -8,8 +8,6 @@ each Gaussian's sum is taken over its tiles in ascending order, whatever the sla
 
 import warp as wp
 
-from gdpro_sim.kernels.projection import vec4s
-
 wp.set_module_options(
     {
         "enable_backward": False,

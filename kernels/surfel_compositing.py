@@ -188,7 +188,7 @@ BATCH = f"""
         }}
 """
 """CPU snippet: list from `at` on -> `held` entries in `rows`, u0 .. my0; {each}, between {declare} and {end},
-takes masks of the 16 entries from `first` on: whose `disc` may reach block k, and which need HIT there, `low`."""
+takes masks of the 16 entries from `first` on: whose `disc` may reach block k, and which need HIT (`low`)."""
 
 RAY = f"""
             const float* const r = rows[i];

@@ -35,7 +35,8 @@ def first_tile(rect: vec4s, camera: int, tiles_x: int, tiles_y: int) -> int:
 
 _EACH = """
     const int count = order.shape[1] / 2, cameras = order.shape[0];
-    const int begin = (int)((long long)count * part / parts), end = (int)((long long)count * (part + 1) / parts);
+    const int begin = (int)((long long)count * part / parts),
+        end = (int)((long long)count * (part + 1) / parts);
     int* const counts = counts_out.data + (size_t)part * counts_out.shape[1];
     const short* const rect = (const short*)rects.data;
     for (int camera = 0; camera < cameras; ++camera) {

@@ -211,7 +211,7 @@ def gradient_sums(
     g_alphas: torch.Tensor,
     blending: Blending,
 ) -> torch.Tensor:
-    """Gradients [M, 16] of the records, see `gdpro_sim.kernels.compositing_backward`; CHANNELS those blended."""
+    """Gradients [M, 16] of records, see `gdpro_sim.kernels.compositing_backward`; CHANNELS those blended."""
     view = blending.view
     inputs = [
         *_sources(records, channels, lists),
@@ -252,7 +252,7 @@ def gradient_sums(
 def weigh(
     projection: Projection, lists: TileLists, result: Composite, view: View, tile: bool, values: torch.Tensor
 ) -> torch.Tensor:
-    """Sums over pixels of blending weight times `values` [C H W, count <= 4]: [M, count], without gradients."""
+    """Sums over pixels of weight times `values` [C H W, count <= 4]: [M, count], without gradients."""
     count = values.shape[1]
     if len(projection.records) == 0:
         return values.new_zeros((0, count))

@@ -19,7 +19,9 @@ Weigh = Callable[[torch.Tensor], torch.Tensor]
 
 
 def contributions(meta: dict[str, Any], values: torch.Tensor | None = None) -> torch.Tensor:
-    """Sum over pixels of each Gaussian's blending weight alpha T, after `rasterization` or `rasterization_2dgs` gave `meta`.
+    """Sum over pixels of each Gaussian's blending weight alpha T.
+
+    `meta` is what `rasterization` or `rasterization_2dgs` gave.
 
     Returns [C, N] float32, or where `values` [C, H, W, D] is given [C, N, D], the sum of weight times value:
     divided by the former, the mean of what the Gaussian shows. Zero for Gaussians that are not drawn, or that

@@ -10,8 +10,8 @@ def shortest_axes(
 ) -> torch.Tensor:
     """Unit axes [C, N, 3] along which N Gaussians are thinnest, in world space, turned towards C cameras.
 
-    The argument shapes are those of `rasterization`. Gradients reach `quats`; for a quaternion that is zero or
-    not finite the axis is that of the identity.
+    The argument shapes are those of `rasterization`. Gradients reach `quats`; for a quaternion that is
+    zero or not finite the axis is that of the identity.
     """
     usable = torch.isfinite(quats).all(1, keepdim=True) & (quats != 0).any(1, keepdim=True)
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])

@@ -40,8 +40,8 @@ class View:
 class Projection:
     """C x N projected Gaussians; M = C N, record c N + n is Gaussian n seen by camera c.
 
-    records: [M, 16] float32, see `gdpro_sim.kernels.projection`; zeros where culled. Its depths, opacities and
-             factors carry gradients, its channels too; its means do not: `means2d` does
+    records: [M, 16] float32, see `gdpro_sim.kernels.projection`; zeros where culled. Its depths, opacities,
+             factors and channels carry gradients; its means do not: `means2d` does
     means2d: [C, N, 2] pixels
     radii:   [M, 2] int32, half extents in pixels of the box outside which alpha < 1/255; zeros where culled
     rects:   [M, 4] int16, tiles touched: x begin, y begin, x end, y end (exclusive); zeros where culled
@@ -108,7 +108,7 @@ def project(
     degree: int | None,
     view: View,
 ) -> Projection:
-    """Project N >= 1 Gaussians (means, quats, scales, opacities) into C >= 1 cameras; sort each camera's by depth.
+    """Project N >= 1 Gaussians (means, quats, scales, opacities) into C >= 1 cameras, and sort by depth.
 
     The first four channels of the records are colour and depth from `colors` [N, K, 3] of spherical harmonics
     where `degree` is given, else the first four of (`colors` [N or C N, D], depth), D >= 0.

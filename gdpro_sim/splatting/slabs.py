@@ -20,7 +20,7 @@ TILE_WORK = 32
 
 
 def balanced_slabs(begins: torch.Tensor, ends: torch.Tensor, slabs: int) -> list[int]:
-    """Bounds [slabs + 1] of consecutive runs of tiles with about equally many entries begins[t] .. ends[t]."""
+    """Bounds [slabs + 1] of runs of tiles with about equally many entries, begins[t] .. ends[t] - 1."""
     tiles = len(begins)
     work = torch.cumsum(ends.to(torch.int64) - begins + TILE_WORK, 0)
     shares = torch.arange(1, slabs) * int(work[-1]) // slabs
@@ -39,8 +39,8 @@ def add_over_tiles(
 
     `launch(first, last, arguments)` runs a kernel of `module` over tiles first .. last - 1 with these last
     arguments: rects, slab begin, slab end, where each tile's spills begin [tiles + 1], sums [M, width],
-    spill ids [E], spills [E, width]. The kernel must add to `sums` where the Gaussian touches tiles of the slab alone, and
-    else write the next of its tile's spills; it may leave out what adds nothing.
+    spill ids [E], spills [E, width]. The kernel must add to `sums` where the Gaussian touches
+    tiles of the slab alone, and else write the next of its tile's spills; it may leave out what adds nothing.
     """
     tiles = len(lists.offsets) - 1
     rects_array = array(rects, vec4s)
@@ -56,8 +56,8 @@ def add_over_tiles(
     wp.load_module(module, device="cpu")
     wp.load_module(kernels, device="cpu")
     bounds = balanced_slabs(lists.offsets[:-1], stops, slabs)
-    # A tile spills no more than its entries, so its spills have place at their numbers. Most of this memory is
-    # never touched.
+    # A tile spills no more than its entries, so its spills have place at their numbers. Most of this
+    # memory is never touched.
     entries = len(lists.ids)
     spill_ids = buffers.empty((entries,), torch.int32, rects.device).fill_(-1)
     spills = buffers.empty((entries, width), torch.float32, rects.device)
