@@ -27,7 +27,7 @@ from gdpro_sim.kernels.projection import (
     RECORD,
     TILE,
 )
-from gdpro_sim.kernels.surfel_images import IMAGES
+from gdpro_sim.kernels.images import IMAGES
 
 wp.set_module_options(
     {

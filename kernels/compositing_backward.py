@@ -39,7 +39,7 @@ from gdpro_sim.kernels.projection import (
     vec4s,
 )
 from gdpro_sim.kernels.slabs import IN_SLAB
-from gdpro_sim.kernels.surfel_images import IMAGES
+from gdpro_sim.kernels.images import IMAGES
 
 wp.set_module_options(
     {

@@ -30,7 +30,7 @@ from gdpro_sim.kernels.compositing import (
 )
 from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
 from gdpro_sim.kernels.projection import LOG2_CUTOFF, SLACK
-from gdpro_sim.kernels.surfel_images import IMAGES
+from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.surfels import (
     BLUR,
     BOX,

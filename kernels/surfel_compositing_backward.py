@@ -33,7 +33,7 @@ from gdpro_sim.kernels.surfel_compositing import (
     VECTOR,
     WEIGH,
 )
-from gdpro_sim.kernels.surfel_images import IMAGES
+from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.surfels import (
     BLUR,
     CENTER,

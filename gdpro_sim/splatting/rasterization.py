@@ -81,8 +81,8 @@ def rasterization(
 
     All tensors are float32 on one device, CPU or CUDA, which decides where the work is done; memory is shared
     with Warp, not copied. On a CPU images and gradients are the same to the bit for any number of threads.
-    Gradients flow to means, quats, scales, opacities, colors, viewmats (the upper three rows, as free numbers),
-    Ks and backgrounds; none where alpha is limited to 0.99 or a colour to 0, or a Gaussian is not drawn.
+    Gradients flow to means, quats, scales, opacities, colors, viewmats (three upper rows, as free numbers), Ks
+    and backgrounds; none where alpha is limited to 0.99 or a colour to 0, or a Gaussian is not drawn.
 
     means      [N, 3] metres
     quats      [N, 4] wxyz, any length but zero
@@ -111,8 +111,8 @@ def rasterization(
         means2d [C, N, 2], depths [C, N], opacities [C, N], radii [C, N, 2] (pixels; zero where not drawn)
         isect_offsets [C, tile_height, tile_width], flatten_ids [E]  tile lists: Gaussian c N + n, by depth
         transmittance [C, H, W]                                      what reaches the background
-        normals [C, H, W, 3], with RasterOptions(normals=True)       sum of weight times shortest axis, in world
-                                                                     space, turned towards the camera
+        normals [C, H, W, 3], with RasterOptions(normals=True)       sum of weight times shortest axis, in
+                                                                     world space, towards the camera
         projection, tile_lists, composite, weigh                     the stages' own results
     means2d, depths, opacities and normals carry gradients; `means2d.retain_grad()` works as with gsplat.
 
