@@ -144,15 +144,6 @@ def device_name(tensor: torch.Tensor) -> str:
     return str(wp.device_from_torch(tensor.device))
 
 
-def torch_stream(tensor: torch.Tensor) -> contextlib.AbstractContextManager[object]:
-    """Run Warp's work on torch's current CUDA stream, so neither has to wait for the other."""
-    if device_name(tensor) == "cpu":
-        return contextlib.nullcontext()
-    import torch
-
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
-
-
 @contextlib.contextmanager
 def serial_torch() -> Iterator[None]:
     """Run torch's own CPU operators on one thread inside the block.
@@ -168,6 +159,19 @@ def serial_torch() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def torch_stream(tensor: torch.Tensor) -> contextlib.AbstractContextManager[object]:
+    """Work of Warp and torch on a tensor's device, side by side.
+
+    On a GPU Warp works on torch's current stream, so neither has to wait for the other. On a CPU torch's
+    operators keep to one thread, see `serial_torch`.
+    """
+    if device_name(tensor) == "cpu":
+        return serial_torch()
+    import torch
+
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
 
 
 def launch_chunked(

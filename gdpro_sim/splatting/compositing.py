@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked, run_chunks, serial_torch, thread_count, torch_stream
+from gdpro_sim.device import device_name, launch_chunked, run_chunks, thread_count, torch_stream
 from gdpro_sim.kernels import compositing as kernels
 from gdpro_sim.kernels import compositing_backward
 from gdpro_sim.kernels.projection import BOX, CHANNELS, MEAN, RECORD, TILE
@@ -167,36 +167,41 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         g_image, g_alphas = gradients[:2]
-        records, means2d, channels, rects, image, transmittance, stops = ctx.saved_tensors
         if g_image is None and g_alphas is None:
             return (None,) * 7
-        g_image = torch.zeros_like(image) if g_image is None else g_image.contiguous()
-        g_alphas = image.new_empty(0) if g_alphas is None else g_alphas.contiguous()
-        blending: Blending = ctx.blending
-        g_backgrounds = None
-        if ctx.needs_input_grad[3]:
-            with serial_torch():
-                pixels = blending.view.height * blending.view.width
-                covered = (transmittance[:, None] * g_image).view(ctx.cameras, pixels, blending.count)
-                g_backgrounds = covered.double().sum(1).float()
-                if blending.divided >= 0:
-                    g_backgrounds[:, blending.divided] = 0.0
-        if len(records) == 0:
-            return torch.zeros_like(records), torch.zeros_like(means2d), None, g_backgrounds, None, None, None
-        with torch_stream(records):
-            sums = gradient_sums(
-                records, channels, ctx.lists, rects, stops, image, transmittance, g_image, g_alphas, blending
-            )
-        if blending.absgrad:
-            total = sums[:, BOX : BOX + 2].view_as(means2d).clone()
-            before = getattr(means2d, "absgrad", None)
-            means2d.absgrad = total if before is None else before + total
-        g_means2d = sums[:, MEAN : MEAN + 2].reshape(means2d.shape)
-        g_channels = None
-        if channels is not None:
-            g_channels = sums[:, CHANNELS : CHANNELS + GROUP].clone()
-            sums[:, CHANNELS : CHANNELS + GROUP] = 0.0
-        return sums, g_means2d, g_channels, g_backgrounds, None, None, None
+        with torch_stream(ctx.saved_tensors[0]):
+            return _blend_backward(ctx, g_image, g_alphas)
+
+
+def _blend_backward(
+    ctx: Any, g_image: torch.Tensor | None, g_alphas: torch.Tensor | None
+) -> tuple[torch.Tensor | None, ...]:
+    records, means2d, channels, rects, image, transmittance, stops = ctx.saved_tensors
+    g_image = torch.zeros_like(image) if g_image is None else g_image.contiguous()
+    g_alphas = image.new_empty(0) if g_alphas is None else g_alphas.contiguous()
+    blending: Blending = ctx.blending
+    g_backgrounds = None
+    if ctx.needs_input_grad[3]:
+        pixels = blending.view.height * blending.view.width
+        covered = (transmittance[:, None] * g_image).view(ctx.cameras, pixels, blending.count)
+        g_backgrounds = covered.double().sum(1).float()
+        if blending.divided >= 0:
+            g_backgrounds[:, blending.divided] = 0.0
+    if len(records) == 0:
+        return torch.zeros_like(records), torch.zeros_like(means2d), None, g_backgrounds, None, None, None
+    sums = gradient_sums(
+        records, channels, ctx.lists, rects, stops, image, transmittance, g_image, g_alphas, blending
+    )
+    if blending.absgrad:
+        total = sums[:, BOX : BOX + 2].view_as(means2d).clone()
+        before = getattr(means2d, "absgrad", None)
+        means2d.absgrad = total if before is None else before + total
+    g_means2d = sums[:, MEAN : MEAN + 2].reshape(means2d.shape)
+    g_channels = None
+    if channels is not None:
+        g_channels = sums[:, CHANNELS : CHANNELS + GROUP].clone()
+        sums[:, CHANNELS : CHANNELS + GROUP] = 0.0
+    return sums, g_means2d, g_channels, g_backgrounds, None, None, None
 
 
 def gradient_sums(

@@ -81,8 +81,8 @@ def rasterization(
 
     All tensors are float32 on one device, CPU or CUDA, which decides where the work is done; memory is shared
     with Warp, not copied. On a CPU images and gradients are the same to the bit for any number of threads.
-    Gradients flow to means, quats, scales, opacities, colors, viewmats (three upper rows, as free numbers), Ks
-    and backgrounds; none where alpha is limited to 0.99 or a colour to 0, or a Gaussian is not drawn.
+    Gradients flow to means, quats, scales, opacities, colors, viewmats (all of their upper three rows), Ks and
+    backgrounds; there is none where alpha is limited to 0.99, a colour to 0, or a Gaussian is not drawn.
 
     means      [N, 3] metres
     quats      [N, 4] wxyz, any length but zero
@@ -175,31 +175,32 @@ def rasterization(
             gaussians, flat, degree, view, options.max_tile_entries, tile=tile
         )
         result = composite(projection, lists, flat, background, divided, view, tile=tile, absgrad=absgrad)
-    meta: dict[str, Any] = {
-        "width": width,
-        "height": height,
-        "tile_size": 16,
-        "tile_width": columns,
-        "tile_height": rows,
-        "n_cameras": cameras,
-        "means2d": projection.means2d,
-        "depths": projection.depths,
-        "opacities": projection.opacities,
-        "radii": projection.radii.view(cameras, count, 2),
-        "isect_offsets": lists.offsets[:-1].view(cameras, rows, columns),
-        "flatten_ids": lists.ids,
-        "transmittance": result.transmittance,
-        "projection": projection,
-        "tile_lists": lists,
-        "composite": result,
-        "weigh": partial(weigh, projection, lists, result, view, tile),
-    }
-    if options.normals:
-        axes = torch.nn.functional.pad(shortest_axes(means, quats, scales, viewmats), (0, 1)).flatten(0, 1)
-        with torch_stream(means):
+        meta: dict[str, Any] = {
+            "width": width,
+            "height": height,
+            "tile_size": 16,
+            "tile_width": columns,
+            "tile_height": rows,
+            "n_cameras": cameras,
+            "means2d": projection.means2d,
+            "depths": projection.depths,
+            "opacities": projection.opacities,
+            "radii": projection.radii.view(cameras, count, 2),
+            "isect_offsets": lists.offsets[:-1].view(cameras, rows, columns),
+            "flatten_ids": lists.ids,
+            "transmittance": result.transmittance,
+            "projection": projection,
+            "tile_lists": lists,
+            "composite": result,
+            "weigh": partial(weigh, projection, lists, result, view, tile),
+        }
+        if options.normals:
+            axes = torch.nn.functional.pad(shortest_axes(means, quats, scales, viewmats), (0, 1)).flatten(
+                0, 1
+            )
             nothing, blending = means.new_zeros((cameras, 3)), Blending(view, 3, -1, tile, absgrad)
             meta["normals"] = blend(projection, lists, axes, nothing, blending).image
-    return result.image, result.alphas, meta
+        return result.image, result.alphas, meta
 
 
 def _project_and_bin(
