@@ -81,8 +81,8 @@ def rasterization(
 
     All tensors are float32 on one device, CPU or CUDA, which decides where the work is done; memory is shared
     with Warp, not copied. On a CPU images and gradients are the same to the bit for any number of threads.
-    Gradients flow to means, quats, scales, opacities, colors, viewmats (all of their upper three rows), Ks and
-    backgrounds; there is none where alpha is limited to 0.99, a colour to 0, or a Gaussian is not drawn.
+    Gradients flow to means, quats, scales, opacities, colors, backgrounds, viewmats (upper three rows), Ks;
+    there is none where alpha is limited to 0.99, a colour to 0, or a Gaussian is not drawn.
 
     means      [N, 3] metres
     quats      [N, 4] wxyz, any length but zero
@@ -109,6 +109,7 @@ def rasterization(
     Returns colours [C, H, W, D], alphas [C, H, W, 1] and a dict with
         width, height, tile_size, tile_width, tile_height, n_cameras  numbers
         means2d [C, N, 2], depths [C, N], opacities [C, N], radii [C, N, 2] (pixels; zero where not drawn)
+        camera_ids, gaussian_ids  None, as in gsplat where nothing is packed
         isect_offsets [C, tile_height, tile_width], flatten_ids [E]  tile lists: Gaussian c N + n, by depth
         transmittance [C, H, W]                                      what reaches the background
         normals [C, H, W, 3], with RasterOptions(normals=True)       sum of weight times shortest axis, in
@@ -186,6 +187,8 @@ def rasterization(
             "depths": projection.depths,
             "opacities": projection.opacities,
             "radii": projection.radii.view(cameras, count, 2),
+            "camera_ids": None,
+            "gaussian_ids": None,
             "isect_offsets": lists.offsets[:-1].view(cameras, rows, columns),
             "flatten_ids": lists.ids,
             "transmittance": result.transmittance,
