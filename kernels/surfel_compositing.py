@@ -28,9 +28,9 @@ from gdpro_sim.kernels.compositing import (
     TILE_LANES,
     TRANSMITTANCE_MIN,
 )
+from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
 from gdpro_sim.kernels.projection import LOG2_CUTOFF, SLACK
-from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.surfels import (
     BLUR,
     BOX,

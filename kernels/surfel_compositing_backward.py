@@ -17,6 +17,7 @@ import warp as wp
 
 from gdpro_sim.kernels.compositing import BATCH_SIZE, EXP2, LN2, LOCATE_PIXEL, LOCATE_TILE, PASS
 from gdpro_sim.kernels.compositing_backward import SPILL, WARP_SUMS
+from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.kernels.slabs import IN_SLAB
@@ -33,7 +34,6 @@ from gdpro_sim.kernels.surfel_compositing import (
     VECTOR,
     WEIGH,
 )
-from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.surfels import (
     BLUR,
     CENTER,

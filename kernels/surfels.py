@@ -87,7 +87,7 @@ SURFEL = f"""
     }}
     const F s0 = deviations[0], s1 = deviations[1];
 
-    // In double precision: seen nearly from its edge, a disc's image is made of differences of nearly equal terms.
+    // In double precision: nearly from its edge, a disc's image is made of differences of nearly equal terms.
 #if defined(__CUDACC__)
     typedef double D;
     auto wide = [](F v) {{ return (double)v; }};
@@ -102,19 +102,20 @@ SURFEL = f"""
     const D d00 = 1.0 - twice * (dy * dy + dz * dz), d10 = twice * (dx * dy + dw * dz),
         d20 = twice * (dx * dz - dw * dy), d01 = twice * (dx * dy - dw * dz),
         d11 = 1.0 - twice * (dx * dx + dz * dz), d21 = twice * (dy * dz + dw * dx);
-    const double e00 = r00, e01 = r01, e02 = r02, e10 = r10, e11 = r11, e12 = r12, e20 = r20, e21 = r21, e22 = r22;
+    const double e00 = r00, e01 = r01, e02 = r02, e10 = r10, e11 = r11, e12 = r12, e20 = r20, e21 = r21,
+        e22 = r22, e03 = view[3], e13 = view[7], e23 = view[11], fx_ = fx, skew_ = skew, fy_ = fy;
     const D ax_ = e00 * d00 + e01 * d10 + e02 * d20, ay_ = e10 * d00 + e11 * d10 + e12 * d20,
         az_ = e20 * d00 + e21 * d10 + e22 * d20;
     const D bx_ = e00 * d01 + e01 * d11 + e02 * d21, by_ = e10 * d01 + e11 * d11 + e12 * d21,
         bz_ = e20 * d01 + e21 * d11 + e22 * d21;
     const D px = wide(mx), py = wide(my), pz = wide(mz);
-    const D x_ = e00 * px + e01 * py + e02 * pz + (double)view[3], y_ = e10 * px + e11 * py + e12 * pz + (double)view[7],
-        z_ = e20 * px + e21 * py + e22 * pz + (double)view[11];
-    const double fx_ = fx, skew_ = skew, fy_ = fy;
+    const D x_ = e00 * px + e01 * py + e02 * pz + e03, y_ = e10 * px + e11 * py + e12 * pz + e13,
+        z_ = e20 * px + e21 * py + e22 * pz + e23;
     const D ox = (fx_ * x_ + skew_ * y_) / z_, oy = fy_ * y_ / z_;
     const D iax_ = fx_ * ax_ + skew_ * ay_ - ox * az_, iay_ = fy_ * ay_ - oy * az_;
     const D ibx_ = fx_ * bx_ + skew_ * by_ - ox * bz_, iby_ = fy_ * by_ - oy * bz_;
-    const F ax = narrow(ax_), ay = narrow(ay_), az = narrow(az_), bx = narrow(bx_), by = narrow(by_), bz = narrow(bz_);
+    const F ax = narrow(ax_), ay = narrow(ay_), az = narrow(az_);
+    const F bx = narrow(bx_), by = narrow(by_), bz = narrow(bz_);
     const F iax = narrow(iax_), iay = narrow(iay_), ibx = narrow(ibx_), iby = narrow(iby_);
     const F center_x = narrow(ox + (double)cx), center_y = narrow(oy + (double)cy);
     // What a unit square of the disc covers, times z^2; zero for a disc seen from its edge.
@@ -128,7 +129,8 @@ SURFEL = f"""
     const F pu = max_(min_(along / s0, steepest), -steepest),
         pv = max_(min_(along / s1, steepest), -steepest);
     const F u_x = pu * iby, u_y = -pu * ibx, v_x = -pv * iay, v_y = pv * iax;
-    const F w_x = narrow(bz_ * iay_ - az_ * iby_) * inverse_area, w_y = narrow(az_ * ibx_ - bz_ * iax_) * inverse_area;
+    const F w_x = narrow(bz_ * iay_ - az_ * iby_) * inverse_area;
+    const F w_y = narrow(az_ * ibx_ - bz_ * iax_) * inverse_area;
 
     // Centre of the one-sigma circle's image, from the projected centre.
     const F sa = s0 * s0 * az, sb = s1 * s1 * bz;
@@ -143,7 +145,7 @@ SURFEL = f"""
         nz = r20 * q02 + r21 * q12 + r22 * q22;
     const F side = select(nx * x + ny * y + nz * z > 0.0f, splat(-1.0f), splat(1.0f));
 """
-"""Snippet: after CAMERA, PINHOLE and ROTATION -> centre, U, V, SLOPE as u_x .. w_y, shift from centre to mean, side."""
+"""Snippet: after CAMERA, PINHOLE, ROTATION -> centre, U, V, SLOPE as u_x .. w_y, shift from it to mean, side."""
 
 _PROJECT = f"""
     const int groups = (means.shape[0] + lanes_per_group - 1) / lanes_per_group;
