@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from gdpro_sim.device import torch_stream
+from gdpro_sim.splatting.batches import batched
 from gdpro_sim.splatting.checks import (
     INDEX_LIMIT,
     check_choice,
@@ -54,6 +55,7 @@ class RasterOptions:
             )
 
 
+@batched
 def rasterization(
     means: torch.Tensor,
     quats: torch.Tensor,
@@ -116,6 +118,9 @@ def rasterization(
                                                                      world space, towards the camera
         projection, tile_lists, composite, weigh                     the stages' own results
     means2d, depths, opacities and normals carry gradients; `means2d.retain_grad()` works as with gsplat.
+
+    All tensors may have the same leading axes: scenes, drawn one after the other. Images have them too, and
+    `meta["batches"]` lists each scene's own `meta`.
 
     A Gaussian is not drawn where its parameters or colour hold NaN or infinity, or its quaternion is zero.
     Raises ValueError where an argument is malformed, and RequestError where counts do not fit 32-bit indices.

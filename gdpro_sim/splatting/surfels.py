@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from gdpro_sim.device import torch_stream
+from gdpro_sim.splatting.batches import batched
 from gdpro_sim.splatting.checks import (
     check_choice,
     check_colors,
@@ -26,6 +27,7 @@ from gdpro_sim.splatting.tiles import TileLists, count_and_fill, empty_lists, ex
 DEPTH_MODES = ("expected", "median")
 
 
+@batched
 def rasterization_2dgs(
     means: torch.Tensor,
     quats: torch.Tensor,
@@ -183,6 +185,8 @@ def rasterization_2dgs(
         "normals": projection.normals,
         "opacities": opacities.expand(cameras, count),
         "radii": projection.radii.view(cameras, count, 2),
+        "camera_ids": None,
+        "gaussian_ids": None,
         "isect_offsets": lists.offsets[:-1].view(cameras, rows, columns),
         "flatten_ids": lists.ids,
         "transmittance": result.transmittance,
