@@ -19,7 +19,7 @@ BATCHED = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", 
 def batched(render: Render) -> Render:
     """Let a rasteriser take `means` [..., N, 3] and all other tensors with the same leading axes.
 
-    Every image it returns has them too. In the last result, `meta`, tensors of one shape are stacked alike, and
+    Every image it returns has them too. In the last result, `meta`, tensors of one shape are stacked, and
     `meta["batches"]` lists what each scene gave: gradients at `means2d` are found there.
     """
     signature = inspect.signature(render)
