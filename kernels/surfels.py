@@ -145,7 +145,7 @@ SURFEL = f"""
         nz = r20 * q02 + r21 * q12 + r22 * q22;
     const F side = select(nx * x + ny * y + nz * z > 0.0f, splat(-1.0f), splat(1.0f));
 """
-"""Snippet: after CAMERA, PINHOLE, ROTATION -> centre, U, V, SLOPE as u_x .. w_y, shift from it to mean, side."""
+"""Snippet: CAMERA, PINHOLE, ROTATION -> centre, U, V, SLOPE as u_x .. w_y, shift from it to MEAN, side."""
 
 _PROJECT = f"""
     const int groups = (means.shape[0] + lanes_per_group - 1) / lanes_per_group;
