@@ -12,6 +12,7 @@ import contextlib
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any
@@ -98,27 +99,47 @@ def set_thread_count(count: int) -> None:
         _pool = None
 
 
-def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1) -> None:
-    """Call `function(begin, end)` over contiguous ranges that cover `range(count)`, one range per thread.
+PIECES = 4
+"""Ranges for each thread, so that one that is held up leaves work to the others."""
 
-    `minimum` is the fewest indices worth a thread of their own. Returns, or raises one of the exceptions,
-    when every range has ended: nothing writes to the caller's memory afterwards.
+
+def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1) -> None:
+    """Call `function(begin, end)` over contiguous ranges that cover `range(count)`, from several threads.
+
+    `minimum` is the fewest indices worth a range of their own. Threads take ranges in ascending order as they
+    come free. Returns, or raises one of the exceptions, when every range has ended: nothing writes to the
+    caller's memory afterwards.
     """
     global _pool
     if count <= 0:
         return
-    chunks = min(thread_count(), max(1, count // max(1, minimum)))
-    if chunks == 1:
+    pieces = min(PIECES * thread_count(), max(1, count // max(1, minimum)))
+    threads = min(thread_count(), pieces)
+    if threads == 1:
         function(0, count)
         return
     if _pool is None:
         _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="gdpro")
-    bounds = [count * i // chunks for i in range(chunks + 1)]
-    futures = [_pool.submit(function, bounds[i], bounds[i + 1]) for i in range(1, chunks)]
+    bounds = [count * i // pieces for i in range(pieces + 1)]
+    numbers = iter(range(pieces))
+    lock = threading.Lock()
+
+    def work() -> None:
+        while True:
+            with lock:
+                piece = next(numbers, None)
+            if piece is None:
+                return
+            function(bounds[piece], bounds[piece + 1])
+
+    futures = [_pool.submit(work) for _ in range(1, threads)]
     try:
-        function(0, bounds[1])
+        work()
         wait(futures)
     except BaseException:
+        with lock:
+            for _ in numbers:  # leave nothing to begin
+                pass
         wait(futures)  # an interrupt ends the wait above
         raise
     for future in futures:
@@ -199,6 +220,7 @@ def launch_chunked(
 
 
 __all__ = [
+    "PIECES",
     "device_name",
     "launch_chunked",
     "resolve_device",

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked, run_chunks, thread_count, torch_stream
+from gdpro_sim.device import PIECES, device_name, launch_chunked, run_chunks, thread_count, torch_stream
 from gdpro_sim.kernels import compositing as kernels
 from gdpro_sim.kernels import compositing_backward
 from gdpro_sim.kernels.projection import BOX, CHANNELS, MEAN, RECORD, TILE
@@ -289,20 +289,21 @@ def _sources(records: torch.Tensor, channels: torch.Tensor | None, lists: TileLi
 
 
 def _launch_tiles(offsets: torch.Tensor, arguments: list[Any]) -> None:
-    """One launch per thread, over runs of tiles with about equally many entries."""
-    threads = min(thread_count(), len(offsets) - 1)
-    if threads == 0:
+    """Launches over runs of tiles with about equally many entries, a few for each thread."""
+    threads, tiles = thread_count(), len(offsets) - 1
+    pieces = 1 if threads == 1 else min(PIECES * threads, tiles)
+    if tiles == 0:
         return
-    if threads > 1:
+    if pieces > 1:
         wp.load_module(kernels, device="cpu")
-    bounds = balanced_slabs(offsets[:-1], offsets[1:], threads)
+    bounds = balanced_slabs(offsets[:-1], offsets[1:], pieces)
 
     def launch(begin: int, end: int) -> None:
         first, last = bounds[begin], bounds[end]
         if first < last:
             wp.launch(kernels.composite_tile, dim=last - first, inputs=[first, *arguments], device="cpu")
 
-    run_chunks(launch, threads)
+    run_chunks(launch, pieces)
 
 
 __all__ = ["GROUP", "Blending", "Composite", "blend", "composite", "gradient_sums", "pack_channels", "weigh"]
