@@ -36,6 +36,24 @@ def test_render_asset(tmp_path: Path) -> None:
     assert np.all(picture[:5] > 250)
 
 
+def test_gsplat_import(tmp_path: Path) -> None:
+    output = run("gsplat_import.py", cwd=tmp_path)
+    losses = [float(line.split()[3]) for line in output.splitlines() if line.startswith("step")]
+    assert len(losses) == 7 and losses[-1] < 1e-3 < 0.1 < losses[0]
+    assert read_png(tmp_path / "gsplat_import.png").shape == (96, 96, 3)
+
+
+@pytest.mark.parametrize("kind", ["gaussians", "surfels"])
+def test_fit_views(tmp_path: Path, kind: str) -> None:
+    arguments = "--size 32 --gaussians 300 --iterations 60".split() + ["--surfels"] * (kind == "surfels")
+    lines = [line for line in run("fit_views.py", *arguments, cwd=tmp_path).splitlines() if "PSNR" in line]
+    psnrs = [float(line.split("PSNR")[1].split()[0]) for line in lines]
+    angles = [float(line.split("off by")[1].split()[0]) for line in lines]
+    assert psnrs[-1] > psnrs[0] + 5.0 and angles[-1] < angles[0]
+    assert read_png(tmp_path / "out/fit_views/held_out.png").shape == (4 * 32, 4 * 32, 3)
+    assert (tmp_path / "out/fit_views/fit.ply").stat().st_size > 300 * 50
+
+
 def test_every_example_is_tested() -> None:
     here = Path(__file__).read_text(encoding="utf-8")
     for script in EXAMPLES.glob("*.py"):
