@@ -63,8 +63,9 @@ camera."""
 
 VECTOR = f"""
 {TILE_LANES}
-    auto min_ = [](F v, F w) {{ return __builtin_elementwise_min(v, w); }};
-    auto max_ = [](F v, F w) {{ return __builtin_elementwise_max(v, w); }};
+    // One instruction each; of NaN and w, w.
+    auto min_ = [](F v, F w) {{ return v < w ? v : w; }};
+    auto max_ = [](F v, F w) {{ return v > w ? v : w; }};
     auto abs_ = [](F v) {{ return __builtin_elementwise_abs(v); }};
 #if defined(__AVX512F__)
     // A 14-bit estimate and one step of Newton's method, to about 1 ulp.
@@ -196,7 +197,6 @@ RAY = f"""
             const F un = fma((F)r[{U}], x, fma((F)r[{U + 1}], y, (F)u0[i]));
             const F vn = fma((F)r[{V}], x, fma((F)r[{V + 1}], y, (F)v0[i]));
             const F wn = fma((F)r[{SLOPE}], x, fma((F)r[{SLOPE + 1}], y, (F)w0[i]));
-            const float l = r[{LOG2_OPACITY}], depth = r[{DEPTH}];
 """
 LOW = """
             const F dx = x + mx0[i], dy = y + my0[i];
@@ -211,32 +211,28 @@ PIXEL_RAY = f"""
         const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
         const float un = r[{U}] * ex + r[{U + 1}] * ey, vn = r[{V}] * ex + r[{V + 1}] * ey;
         const float wn = 1.0f + r[{SLOPE}] * ex + r[{SLOPE + 1}] * ey;
-        const float l = r[{LOG2_OPACITY}], depth = r[{DEPTH}];
 """
 """Snippet for one pixel: entry `at` -> the same."""
 
-_HIT = """
-            const F u = un * inverse, v = vn * inverse;
-            const F disc = fma(u, u, v * v);
-"""
-
 HIT_DISC = f"""
             const F inverse = reciprocal(wn);
-{_HIT}
-            const F p = l - disc;
-            const F scale = inverse;
+            const F u = un * inverse, v = vn * inverse;
+            const F p = fma(-u, u, fma(-v, v, (F)r[{LOG2_OPACITY}]));
+            const F z = inverse * r[{DEPTH}];
 """
-"""Snippet: un = U . e, vn, wn -> p = log2(alpha), scale = z / DEPTH, where the disc is sure to be hit."""
+"""Snippet: un = U . e, vn, wn -> p = log2(alpha) and z, where the disc is sure to be hit."""
 
 HIT = f"""
             const F inverse = reciprocal(max_(wn, nearest));
-{_HIT}
+            const F u = un * inverse, v = vn * inverse;
+            const F disc = fma(u, u, v * v);
             const F low = log2_e * fma(dx, dx, dy * dy);
             const I hit = (wn > nearest) & (disc <= low);
-            const F p = l - (hit ? disc : low);
+            const F p = r[{LOG2_OPACITY}] - (hit ? disc : low);
             const F scale = hit ? inverse : one;
+            const F z = scale * r[{DEPTH}];
 """
-"""The same with the low-pass, and where the disc is not hit; dx, dy from the mean."""
+"""The same with the low-pass, and where the disc is not hit, and scale = z / DEPTH; dx, dy from the mean."""
 
 WEIGH = """
             const I seen = p >= cutoff;
@@ -244,9 +240,8 @@ WEIGH = """
             const F next = fma(-alpha, t, t);
             const I blend = seen & (next > transmittance_min);
             const F w = blend ? alpha * t : zero;
-            const F z = depth * scale;
 """
-"""Snippet: raw alpha and transmittance t -> weight w of what blends, and depth z."""
+"""Snippet: raw alpha and transmittance t -> weight w of what blends."""
 
 _ADD = f"""
             c0 = fma(w, (F)c[0], c0);
