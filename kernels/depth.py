@@ -90,7 +90,9 @@ _FORWARD = f"""
             continue;
         }}
 {_NORMAL}
-        const F normal[3] = {{select(seen, n0, zero), select(seen, n1, zero), select(seen, n2, zero)}};
+        const F weight = weights.data ? load(weights.data + (size_t)row * width + x, 1) : one;
+        const F normal[3] = {{
+            select(seen, weight * n0, zero), select(seen, weight * n1, zero), select(seen, weight * n2, zero)}};
         store3(out, normal);
     }}
 """
@@ -112,7 +114,8 @@ _BACKWARD = f"""
 {_NORMAL}
         F g[3];
         load3(gradients + 3 * x, g);
-        const F g0 = g[0], g1 = g[1], g2 = g[2];
+        const F weight = weights.data ? load(weights.data + (size_t)row * width + x, 1) : one;
+        const F g0 = g[0] * weight, g1 = g[1] * weight, g2 = g[2] * weight;
         const F along_n = g0 * n0 + g1 * n1 + g2 * n2;
         const F h0 = (g0 - along_n * n0) * inverse, h1 = (g1 - along_n * n1) * inverse,
             h2 = (g2 - along_n * n2) * inverse;
@@ -180,6 +183,7 @@ def normals_of_span(
     intrinsics: wp.array[wp.mat33],
     width: int,
     height: int,
+    weights: wp.array[float],
     normals_out: wp.array[float],
 ): ...
 
@@ -194,11 +198,12 @@ def depth_normals(
     intrinsics: wp.array[wp.mat33],
     width: int,
     height: int,
+    weights: wp.array[float],
     # Out:
     normals_out: wp.array[float],
 ):
-    """Normals [C H W 3] of depth [C H W]. `span` is the width on a CPU."""
-    normals_of_span(start + wp.tid(), span, depth, viewmats, intrinsics, width, height, normals_out)
+    """Normals [C H W 3] of depth [C H W], times weights [C H W] or, where empty, one. `span` >= 1."""
+    normals_of_span(start + wp.tid(), span, depth, viewmats, intrinsics, width, height, weights, normals_out)
 
 
 @wp.func_native(_BACKWARD)
@@ -210,6 +215,7 @@ def gradients_of_span(
     intrinsics: wp.array[wp.mat33],
     width: int,
     height: int,
+    weights: wp.array[float],
     g_normals: wp.array[float],
     g_ratios_out: wp.array2d[float],
     g_cameras_out: wp.array2d[float],
@@ -226,6 +232,7 @@ def depth_normals_backward(
     intrinsics: wp.array[wp.mat33],
     width: int,
     height: int,
+    weights: wp.array[float],
     g_normals: wp.array[float],
     # Out:
     g_ratios_out: wp.array2d[float],
@@ -244,6 +251,7 @@ def depth_normals_backward(
         intrinsics,
         width,
         height,
+        weights,
         g_normals,
         g_ratios_out,
         g_cameras_out,

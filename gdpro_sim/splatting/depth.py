@@ -10,16 +10,19 @@ import warp as wp
 from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.kernels import depth as kernels
 from gdpro_sim.splatting import buffers
-from gdpro_sim.splatting.images import check_images
+from gdpro_sim.splatting.images import check_alike, check_images
 from gdpro_sim.splatting.projection import array
 
 
-def depth_to_normals(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
+def depth_to_normals(
+    depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor, weights: torch.Tensor | None = None
+) -> torch.Tensor:
     """World-space unit normals [C, H, W, 3] of the surface in depth images, facing the camera.
 
     depth     [C, H, W, 1] z along the camera's axis (not along the ray), in the unit of `viewmats`, >= 0
     viewmats  [C, 4, 4] rigid, world to camera, OpenCV axes (+z forward, +y down)
     Ks        [C, 3, 3] pixels, skew Ks[:, 0, 1] included; pixel centres lie at +0.5
+    weights   [C, H, W, 1] factors of the normals, to which there is no gradient
 
     The normal of a pixel is the cross product of the central differences, down and right, of its neighbours'
     back-projected points (gsplat's convention). It is zero on the image's border, and where both neighbours
@@ -33,12 +36,17 @@ def depth_to_normals(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tens
     """
     depth = check_images("depth", depth, 4, channels=1)
     height, width = depth.shape[1:3]
+    if weights is not None:
+        weights = check_images("weights", weights, 4, channels=1)
+        check_alike(("depth", "weights"), depth, weights)
     _check_matrices(depth, viewmats=viewmats, Ks=Ks)
     if height < 3 or width < 3:
         return depth.expand(-1, -1, -1, 3) * 0.0
     if depth.dtype == torch.float32:
-        return _Normals.apply(depth.contiguous(), viewmats.contiguous(), Ks.contiguous())
-    return _normals(depth, viewmats, Ks)
+        factors = depth.new_empty(0) if weights is None else weights.detach().contiguous()
+        return _Normals.apply(depth.contiguous(), viewmats.contiguous(), Ks.contiguous(), factors)
+    normals = _normals(depth, viewmats, Ks)
+    return normals if weights is None else normals * weights.detach()
 
 
 def _normals(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
@@ -72,21 +80,22 @@ class _Normals(torch.autograd.Function):
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor
+        ctx: Any, depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor, weights: torch.Tensor
     ) -> torch.Tensor:
         normals = buffers.empty((*depth.shape[:3], 3), depth.dtype, depth.device)
         inputs, indices = _spans(depth, viewmats, Ks)
+        inputs.append(array(weights.view(-1), wp.float32))
         outputs = [array(normals.view(-1), wp.float32)]
         with torch_stream(depth):
             launch_chunked(
                 kernels.depth_normals, indices, inputs, outputs, device=device_name(depth), minimum=32
             )
-        ctx.save_for_backward(depth, viewmats, Ks)
+        ctx.save_for_backward(depth, viewmats, Ks, weights)
         return normals
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        depth, viewmats, Ks = ctx.saved_tensors
+        depth, viewmats, Ks, weights = ctx.saved_tensors
         inputs, indices = _spans(depth, viewmats, Ks)
         with_cameras = ctx.needs_input_grad[1] or ctx.needs_input_grad[2]
         g_ratios = buffers.empty((2, depth.numel()), depth.dtype, depth.device)
@@ -94,17 +103,20 @@ class _Normals(torch.autograd.Function):
         g_depth = buffers.empty_like(depth)
         device = device_name(depth)
         with torch_stream(depth):
-            given = array(gradients[0].contiguous().view(-1), wp.float32)
+            given = [
+                array(weights.view(-1), wp.float32),
+                array(gradients[0].contiguous().view(-1), wp.float32),
+            ]
             outputs = [array(g_ratios, wp.float32), array(g_cameras, wp.float32)]
             launch_chunked(
-                kernels.depth_normals_backward, indices, [*inputs, given], outputs, device=device, minimum=32
+                kernels.depth_normals_backward, indices, [*inputs, *given], outputs, device=device, minimum=32
             )
             span, z, _, _, width, height = inputs
             inputs = [span, z, width, height, array(g_ratios, wp.float32)]
             outputs = [array(g_depth.view(-1), wp.float32)]
             launch_chunked(kernels.depth_normals_gather, indices, inputs, outputs, device=device, minimum=32)
         if not with_cameras or indices == 0:
-            return g_depth, None, None
+            return g_depth, None, None, None
         # A cumulative sum goes in order, a sum as it likes.
         total = torch.cumsum(g_cameras.double().view(len(depth), -1, kernels.CAMERA_GRADIENTS), 1)[
             :, -1
@@ -113,7 +125,7 @@ class _Normals(torch.autograd.Function):
         g_viewmats[:, :3, :3] = total[:, :9].view(-1, 3, 3)
         g_Ks[:, 0] = total[:, 9:12]
         g_Ks[:, 1, 1:] = total[:, 12:]
-        return g_depth, g_viewmats, g_Ks
+        return g_depth, g_viewmats, g_Ks, None
 
 
 def _spans(depth: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor) -> tuple[list[Any], int]:

@@ -165,7 +165,7 @@ def rasterization_2dgs(
             depth = result.image[..., -1:]
             if not divided:
                 depth = depth / result.alphas.clamp(min=1e-10)
-        normals_from_depth = depth_to_normals(depth, viewmats, view.Ks) * result.alphas.detach()
+        normals_from_depth = depth_to_normals(depth, viewmats, view.Ks, result.alphas)
 
     blending = SurfelBlending(view, 3, False, False, False, tile, False)
 

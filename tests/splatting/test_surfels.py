@@ -302,6 +302,7 @@ def test_normals_from_depth_in_single_precision(count: int, height: int, width: 
     g = torch.Generator().manual_seed(width)
     depth = 1.0 + torch.rand(count, height, width, 1, generator=g)
     depth *= torch.rand(count, height, width, 1, generator=g) > 0.2
+    weights = torch.rand(depth.shape, generator=g)
     viewmats = torch.eye(4).repeat(count, 1, 1) + 0.1 * torch.randn(count, 4, 4, generator=g)
     Ks = torch.tensor([[[50.0, 3.0, width / 2], [0.0, 60.0, height / 2], [0.0, 0.0, 1.0]]]).repeat(
         count, 1, 1
@@ -309,9 +310,9 @@ def test_normals_from_depth_in_single_precision(count: int, height: int, width: 
     found = []
     for dtype in (torch.float32, torch.float64):
         given_ = [tensor.to(dtype).requires_grad_() for tensor in (depth, viewmats, Ks)]
-        normals = depth_to_normals(*given_)
-        weights = torch.randn(normals.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
-        found.append([normals, *torch.autograd.grad(normals, given_, weights)])
+        normals = depth_to_normals(*given_, weights.to(dtype))
+        upstream = torch.randn(normals.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
+        found.append([normals, *torch.autograd.grad(normals, given_, upstream)])
     for single, double in zip(*found, strict=True):
         assert (single - double).norm() <= 1e-6 * double.norm()
 
