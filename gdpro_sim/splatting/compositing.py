@@ -8,13 +8,13 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import PIECES, device_name, launch_chunked, run_chunks, thread_count, torch_stream
+from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.kernels import compositing as kernels
 from gdpro_sim.kernels import compositing_backward
 from gdpro_sim.kernels.projection import BOX, CHANNELS, MEAN, RECORD, TILE
 from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.projection import Projection, View, array
-from gdpro_sim.splatting.slabs import add_over_tiles, balanced_slabs
+from gdpro_sim.splatting.slabs import add_over_tiles, launch_tiles
 from gdpro_sim.splatting.tiles import TileLists
 
 GROUP = 4
@@ -154,7 +154,7 @@ class _Blend(torch.autograd.Function):
             array(stops, wp.int32),
         ]
         if blending.tile:
-            _launch_tiles(lists.offsets, [*inputs, *outputs])
+            launch_tiles(kernels.composite_tile, lists.offsets, [*inputs, *outputs])
         else:
             count = tiles * int(TILE) ** 2
             launch_chunked(kernels.composite_pixel, count, inputs, outputs, device=device_name(image))
@@ -232,17 +232,9 @@ def gradient_sums(
         array(g_alphas, wp.float32),
     ]
     if blending.tile:
-
-        def launch(first: int, last: int, arguments: list[Any]) -> None:
-            wp.launch(
-                compositing_backward.composite_tile_backward,
-                dim=last - first,
-                inputs=[first, *inputs, *arguments],
-                device="cpu",
-            )
-
-        width = int(RECORD)
-        return add_over_tiles(launch, compositing_backward, lists, stops, rects, width)
+        return add_over_tiles(
+            compositing_backward.composite_tile_backward, inputs, lists, stops, rects, int(RECORD)
+        )
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.
     wp.launch(
@@ -286,24 +278,6 @@ def _sources(records: torch.Tensor, channels: torch.Tensor | None, lists: TileLi
         array(lists.offsets, wp.int32),
         array(lists.ids, wp.int32),
     ]
-
-
-def _launch_tiles(offsets: torch.Tensor, arguments: list[Any]) -> None:
-    """Launches over runs of tiles with about equally many entries, a few for each thread."""
-    threads, tiles = thread_count(), len(offsets) - 1
-    pieces = 1 if threads == 1 else min(PIECES * threads, tiles)
-    if tiles == 0:
-        return
-    if pieces > 1:
-        wp.load_module(kernels, device="cpu")
-    bounds = balanced_slabs(offsets[:-1], offsets[1:], pieces)
-
-    def launch(begin: int, end: int) -> None:
-        first, last = bounds[begin], bounds[end]
-        if first < last:
-            wp.launch(kernels.composite_tile, dim=last - first, inputs=[first, *arguments], device="cpu")
-
-    run_chunks(launch, pieces)
 
 
 __all__ = ["GROUP", "Blending", "Composite", "blend", "composite", "gradient_sums", "pack_channels", "weigh"]

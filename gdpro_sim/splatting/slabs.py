@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
 import warp as wp
 
-from gdpro_sim.device import run_chunks, thread_count
+from gdpro_sim.device import PIECES, run_chunks, thread_count
 from gdpro_sim.kernels import slabs as kernels
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting import buffers
@@ -27,9 +26,27 @@ def balanced_slabs(begins: torch.Tensor, ends: torch.Tensor, slabs: int) -> list
     return [0, *torch.searchsorted(work, shares).tolist(), tiles]
 
 
+def launch_tiles(kernel: wp.Kernel, offsets: torch.Tensor, arguments: list[Any]) -> None:
+    """Run a CPU kernel once per tile, in runs of tiles with about equally many entries, a few per thread."""
+    threads, tiles = thread_count(), len(offsets) - 1
+    if tiles == 0:
+        return
+    pieces = 1 if threads == 1 else min(PIECES * threads, tiles)
+    if pieces > 1:
+        wp.load_module(kernel.module, device="cpu")
+    bounds = balanced_slabs(offsets[:-1], offsets[1:], pieces)
+
+    def launch(begin: int, end: int) -> None:
+        first, last = bounds[begin], bounds[end]
+        if first < last:
+            wp.launch(kernel, dim=last - first, inputs=[first, *arguments], device="cpu")
+
+    run_chunks(launch, pieces)
+
+
 def add_over_tiles(
-    launch: Callable[[int, int, list[Any]], None],
-    module: Any,
+    kernel: wp.Kernel,
+    inputs: list[Any],
     lists: TileLists,
     stops: torch.Tensor,
     rects: torch.Tensor,
@@ -37,10 +54,10 @@ def add_over_tiles(
 ) -> torch.Tensor:
     """Sums [M, width] float32 of what the tiles add to each of M Gaussians.
 
-    `launch(first, last, arguments)` runs a kernel of `module` over tiles first .. last - 1 with these last
-    arguments: rects, slab begin, slab end, where each tile's spills begin [tiles + 1], sums [M, width],
-    spill ids [E], spills [E, width]. The kernel must add to `sums` where the Gaussian touches
-    tiles of the slab alone, and else write the next of its tile's spills; it may leave out what adds nothing.
+    `kernel` runs on a CPU once per tile, with the arguments: first tile of the launch, `inputs`, rects, first
+    and end tile of the slab, where each tile's spills begin [tiles + 1], sums [M, width], spill ids [E] and
+    spills [E, width]. It must add to the sums where the Gaussian touches tiles of the slab alone, and else
+    write the next of its tile's spills; it may leave out what adds nothing.
     """
     tiles = len(lists.offsets) - 1
     rects_array = array(rects, vec4s)
@@ -51,9 +68,9 @@ def add_over_tiles(
         none = torch.empty(0, dtype=torch.int32)
         spills = torch.empty(0, width)
         arguments = [array(none, wp.int32), sums_array, array(none, wp.int32), array(spills, wp.float32)]
-        launch(0, tiles, [rects_array, 0, tiles, *arguments])
+        wp.launch(kernel, dim=tiles, inputs=[0, *inputs, rects_array, 0, tiles, *arguments], device="cpu")
         return sums
-    wp.load_module(module, device="cpu")
+    wp.load_module(kernel.module, device="cpu")
     wp.load_module(kernels, device="cpu")
     bounds = balanced_slabs(lists.offsets[:-1], stops, slabs)
     # A tile spills no more than its entries, so its spills have place at their numbers. Most of this
@@ -67,17 +84,18 @@ def add_over_tiles(
     def run(first: int, last: int) -> None:
         for slab in range(first, last):
             begin, end = bounds[slab], bounds[slab + 1]
+            whole = [begin, *inputs, rects_array, begin, end, *arguments]
             if begin < end:
-                launch(begin, end, [rects_array, begin, end, *arguments])
+                wp.launch(kernel, dim=end - begin, inputs=whole, device="cpu")
 
     run_chunks(run, slabs)
-    inputs = [slabs, array(lists.offsets, wp.int32), *spills_array, sums_array]
+    spilled = [slabs, array(lists.offsets, wp.int32), *spills_array, sums_array]
 
     def merge(first: int, last: int) -> None:
-        wp.launch(kernels.merge_spills, dim=last - first, inputs=[first, *inputs], device="cpu")
+        wp.launch(kernels.merge_spills, dim=last - first, inputs=[first, *spilled], device="cpu")
 
     run_chunks(merge, slabs)
     return sums
 
 
-__all__ = ["add_over_tiles", "balanced_slabs"]
+__all__ = ["add_over_tiles", "launch_tiles"]

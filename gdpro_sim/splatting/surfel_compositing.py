@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked, run_chunks, serial_torch, thread_count, torch_stream
+from gdpro_sim.device import device_name, launch_chunked, serial_torch, torch_stream
 from gdpro_sim.kernels import surfel_compositing as kernels
 from gdpro_sim.kernels import surfel_compositing_backward
 from gdpro_sim.kernels.projection import TILE
@@ -16,7 +16,7 @@ from gdpro_sim.kernels.surfel_compositing_backward import ABSOLUTE
 from gdpro_sim.kernels.surfels import CHANNELS, MEAN, RECORD
 from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.projection import View, array
-from gdpro_sim.splatting.slabs import add_over_tiles, balanced_slabs
+from gdpro_sim.splatting.slabs import add_over_tiles, launch_tiles
 from gdpro_sim.splatting.surfel_projection import SurfelProjection
 from gdpro_sim.splatting.tiles import TileLists
 
@@ -169,7 +169,7 @@ class _Blend(torch.autograd.Function):
             array(medians_at, wp.int32),
         ]
         if blending.tile:
-            _launch_tiles(lists.offsets, [*inputs, *outputs])
+            launch_tiles(kernels.surfel_tile, lists.offsets, [*inputs, *outputs])
         else:
             count = tiles * int(TILE) ** 2
             launch_chunked(kernels.surfel_pixel, count, inputs, outputs, device=device_name(image))
@@ -262,16 +262,9 @@ def gradient_sums(
         *(array(gradient, wp.float32) for gradient in gradients),
     ]
     if blending.tile:
-
-        def launch(first: int, last: int, arguments: list[Any]) -> None:
-            wp.launch(
-                surfel_compositing_backward.surfel_tile_backward,
-                dim=last - first,
-                inputs=[first, *inputs, *arguments],
-                device="cpu",
-            )
-
-        return add_over_tiles(launch, surfel_compositing_backward, lists, stops, rects, RECORD)
+        return add_over_tiles(
+            surfel_compositing_backward.surfel_tile_backward, inputs, lists, stops, rects, RECORD
+        )
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.
     wp.launch(
@@ -328,23 +321,6 @@ def _sources(records: torch.Tensor, channels: torch.Tensor | None, lists: TileLi
         array(lists.offsets, wp.int32),
         array(lists.ids, wp.int32),
     ]
-
-
-def _launch_tiles(offsets: torch.Tensor, arguments: list[Any]) -> None:
-    """One launch per thread, over runs of tiles with about equally many entries."""
-    threads = min(thread_count(), len(offsets) - 1)
-    if threads == 0:
-        return
-    if threads > 1:
-        wp.load_module(kernels, device="cpu")
-    bounds = balanced_slabs(offsets[:-1], offsets[1:], threads)
-
-    def launch(begin: int, end: int) -> None:
-        first, last = bounds[begin], bounds[end]
-        if first < last:
-            wp.launch(kernels.surfel_tile, dim=last - first, inputs=[first, *arguments], device="cpu")
-
-    run_chunks(launch, threads)
 
 
 __all__ = [
