@@ -91,8 +91,8 @@ _FORWARD = f"""
         }}
 {_NORMAL}
         const F weight = weights.data ? load(weights.data + (size_t)row * width + x, 1) : one;
-        const F normal[3] = {{
-            select(seen, weight * n0, zero), select(seen, weight * n1, zero), select(seen, weight * n2, zero)}};
+        const F normal[3] = {{select(seen, weight * n0, zero), select(seen, weight * n1, zero),
+            select(seen, weight * n2, zero)}};
         store3(out, normal);
     }}
 """
