@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.kernels import compositing as kernels
@@ -165,6 +166,7 @@ class _Blend(torch.autograd.Function):
         return image, alphas, transmittance, stops
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         g_image, g_alphas = gradients[:2]
         if g_image is None and g_alphas is None:

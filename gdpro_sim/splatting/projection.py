@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from gdpro_sim.device import device_name, launch_chunked, torch_stream
 from gdpro_sim.kernels import projection as kernels
@@ -108,7 +109,7 @@ def project(
     degree: int | None,
     view: View,
 ) -> Projection:
-    """Project N >= 1 Gaussians (means, quats, scales, opacities) into C >= 1 cameras, and sort by depth.
+    """Project N Gaussians (means, quats, scales, opacities) into C cameras, and sort by depth.
 
     The first four channels of the records are colour and depth from `colors` [N, K, 3] of spherical harmonics
     where `degree` is given, else the first four of (`colors` [N or C N, D], depth), D >= 0.
@@ -174,9 +175,9 @@ class _Project(torch.autograd.Function):
             device=device_name(means),
             minimum=64,
         )
-        for camera in range(cameras):
+        for camera in range(cameras if count > 0 else 0):
             sort_pairs(keys[camera], order[camera], count)
-        means2d = records.view(cameras, count, -1)[..., :2].contiguous()
+        means2d = records.view(cameras, count, int(kernels.RECORD))[..., :2].contiguous()
         ctx.save_for_backward(means, quats, scales, opacities, sh, features, viewmats, Ks, rects)
         ctx.degree, ctx.view = degree, view
         ctx.mark_non_differentiable(radii, rects, order)
@@ -184,6 +185,7 @@ class _Project(torch.autograd.Function):
         return records, means2d, radii, rects, order
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         g_records, g_means2d = gradients[:2]
         if g_records is None and g_means2d is None:
@@ -250,6 +252,9 @@ def _project_backward(
         device=device_name(means),
         minimum=1,
     )
+    if cameras == 0:
+        for gradient in (g_means, g_quats, g_scales, g_opacities, g_sh, g_features):
+            gradient.zero_()
     g_viewmats, g_Ks = camera_gradients(g_cameras) if with_cameras else (None, None)
     return g_means, g_quats, g_scales, g_opacities, g_sh, g_features, g_viewmats, g_Ks, None, None
 
@@ -257,7 +262,7 @@ def _project_backward(
 def camera_gradients(sums: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Partial sums [runs, C, 17] of `projection_backward` -> gradients [C, 4, 4] and [C, 3, 3]."""
     # A cumulative sum goes in order, a sum as it likes.
-    total = torch.cumsum(sums.double(), 0)[-1].float()
+    total = torch.cumsum(sums.double(), 0)[-1].float() if len(sums) else sums.new_zeros(sums.shape[1:])
     g_viewmats = total.new_zeros((len(total), 4, 4))
     g_viewmats[:, :3, :3] = total[:, :9].view(-1, 3, 3)
     g_viewmats[:, :3, 3] = total[:, 9:12]

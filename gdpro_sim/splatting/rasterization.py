@@ -221,18 +221,9 @@ def _project_and_bin(
     tile: bool,
 ) -> tuple[Projection, TileLists]:
     """The first two stages over checked arguments; `colors` [N, K, 3], or [N or C N, F] with F >= 0."""
-    means = gaussians[0]
-    cameras, count = len(view.viewmats), len(means)
-    if cameras * count == 0:
-        nothing = Projection(
-            means.new_zeros((0, 16)),
-            means.new_zeros((cameras, count, 2)),
-            means.new_zeros((0, 2), dtype=torch.int32),
-            means.new_zeros((0, 4), dtype=torch.int16),
-            means.new_zeros((cameras, 0), dtype=torch.int32),
-        )
-        return nothing, empty_lists(cameras, view, means.device)
     projection = project(gaussians, colors, degree, view)
+    if len(projection.records) == 0:
+        return projection, empty_lists(projection.cameras, view, projection.records.device)
     return projection, (count_and_fill if tile else expand_and_sort)(projection, view, limit)
 
 
