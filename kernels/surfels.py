@@ -183,7 +183,7 @@ _PROJECT = f"""
 
 {PIXEL_BOX}    // A sum of magnitudes is finite only where all its terms are.
     const F size = abs_(u_x) + abs_(u_y) + abs_(v_x) + abs_(v_y) + abs_(w_x) + abs_(w_y) + abs_(s0) + abs_(s1)
-        + abs_(opacity) + box_x + box_y + z * 1.0e16f;
+        + abs_(q00) + abs_(q12) + abs_(opacity) + box_x + box_y + z * 1.0e16f;
     const F far_out = abs_(center_x) + abs_(center_y) + abs_(shift_x) + abs_(shift_y);
     I drawn = (z >= near) & (z <= far) & (z > 0.0f) & (extent2 >= 0.0f) & (opacity > 0.0f) & finite(size)
         & (far_out < {STEEPEST!r}f) & (x0 <= x1) & (y0 <= y1)
