@@ -145,7 +145,8 @@ def test_images(seed: int, method: str) -> None:
     for name in OUTPUTS:
         error = (got[name].double() - expected[name]).abs()
         error = error.amax(-1) if error.ndim == 4 else error
-        assert error[far].max() <= 2e-6, name
+        # At 30 pixels the float32 centre of a low-pass is good to 1e-6 pixels, and so is alpha.
+        assert error[far].max() <= 3e-6, name
         assert error[away].max() <= 6e-6, name
     interior = (wider(margin) > KINK) & (-wider(-expected["alpha"]) > 0.05)
     assert (got["from_depth"] - expected["from_depth"])[interior].abs().max() <= 2e-3
