@@ -136,10 +136,13 @@ class Model:
             group["lr"] = first * (last / first) ** share
 
     def gaussians(self) -> Gaussians:
-        rgb = torch.sigmoid(self.colors)
-        return Gaussians(
-            self.means, self.quats, self.log_scales.exp(), self.logits.sigmoid(), rgb_to_sh(rgb)[:, None]
-        )
+        """What was learned as 3D Gaussians; surfels become thin ones."""
+        scales = self.log_scales.exp()
+        if self.surfels:
+            flat = 0.01 * scales[:, :2].amin(dim=1, keepdim=True)
+            scales = torch.cat([scales[:, :2], flat], dim=1)
+        sh = rgb_to_sh(self.colors.sigmoid())[:, None]
+        return Gaussians(self.means, self.quats, scales, self.logits.sigmoid(), sh)
 
     def render(self, cameras: Cameras, which: list[int], backgrounds: Tensor) -> dict[str, Tensor]:
         """rgb over `backgrounds`, alphas, blended normals; of surfels normals from depth and distortion."""

@@ -201,7 +201,7 @@ def print_rates(repeats: int, bound: VectorBound) -> None:
     print(
         "A pair is a pixel and a Gaussian with a weight above zero, counted once in float32. M pairs per "
         "CPU second on one thread, SH 0: over the whole image through the public function (backward: fwd+bwd "
-        "less fwd), and over the compositing kernels alone, with the percentage of this machine's vector bound: "
+        "less fwd), and over the compositing kernels alone, with the percentage of the vector bound: "
         f"{bound.forward / 1e6:.0f} M lane evaluations/s forward, {bound.backward / 1e6:.0f} M backward "
         "(`tests/benchmarks/vector_bound.py`)."
     )

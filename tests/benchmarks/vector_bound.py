@@ -196,7 +196,7 @@ def _table() -> wp.array:
     return wp.array(table, dtype=wp.float32, device="cpu")
 
 
-def vector_bound(repeats: int = 15, rounds: int = 400) -> VectorBound:
+def vector_bound(repeats: int = 60, rounds: int = 400) -> VectorBound:
     """Measure both on one thread: the best of `repeats` by the thread's own CPU time."""
     table, result = _table(), wp.zeros(1, dtype=wp.float32, device="cpu")
     rates = []
