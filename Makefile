@@ -50,6 +50,7 @@ check: lint types test wheel-test  ## everything CI runs
 
 bench: $(DEV)  ## print the benchmark tables (minutes)
 	$(VENV)/bin/python -m tests.benchmarks.bench_pipeline
+	$(VENV)/bin/python -m tests.benchmarks.bench_splatting
 
 clean:  ## remove the virtual environment and results
 	rm -rf $(VENV) out build dist *.egg-info

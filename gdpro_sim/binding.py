@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked, torch_stream
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.errors import AssetError
 from gdpro_sim.gaussians import SH_C0, Gaussians
 from gdpro_sim.kernels.binding import follow_triangles
@@ -88,7 +88,7 @@ class BoundGaussians:
             name = device_name(moved)
             directions, inverse = _sh_rotation_tables(degree, name)
             rest_sh = wp.from_torch(self.sh.detach().contiguous(), dtype=wp.vec3)
-            with torch_stream(moved):
+            with beside_torch(moved):
                 launch_chunked(
                     follow_triangles,
                     n,

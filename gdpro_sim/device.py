@@ -182,7 +182,7 @@ def serial_torch() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def torch_stream(tensor: torch.Tensor) -> contextlib.AbstractContextManager[object]:
+def beside_torch(tensor: torch.Tensor) -> contextlib.AbstractContextManager[object]:
     """Work of Warp and torch on a tensor's device, side by side.
 
     On a GPU Warp works on torch's current stream, so neither has to wait for the other. On a CPU torch's
@@ -221,6 +221,7 @@ def launch_chunked(
 
 __all__ = [
     "PIECES",
+    "beside_torch",
     "device_name",
     "launch_chunked",
     "resolve_device",
@@ -228,5 +229,4 @@ __all__ = [
     "serial_torch",
     "set_thread_count",
     "thread_count",
-    "torch_stream",
 ]

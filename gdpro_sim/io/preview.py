@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.device import device_name, launch_chunked, torch_stream
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.gaussians import SH_C0, Gaussians
 from gdpro_sim.kernels.shading import gather_light
 from gdpro_sim.splatting import rasterization
@@ -93,7 +93,7 @@ class _ShadowMaps:
         """Light of the key and of the sky, and the key's visibility, at points and unit normals [M, 3]."""
         device = points.device
         light = torch.empty((len(points), 3), dtype=torch.float32, device=device)
-        with torch_stream(points):
+        with beside_torch(points):
             launch_chunked(
                 gather_light,
                 len(points),

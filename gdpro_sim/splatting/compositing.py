@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from gdpro_sim.device import device_name, launch_chunked, torch_stream
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import compositing as kernels
 from gdpro_sim.kernels import compositing_backward
 from gdpro_sim.kernels.projection import BOX, CHANNELS, MEAN, RECORD, TILE
@@ -171,7 +171,7 @@ class _Blend(torch.autograd.Function):
         g_image, g_alphas = gradients[:2]
         if g_image is None and g_alphas is None:
             return (None,) * 7
-        with torch_stream(ctx.saved_tensors[0]):
+        with beside_torch(ctx.saved_tensors[0]):
             return _blend_backward(ctx, g_image, g_alphas)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from gdpro_sim.device import torch_stream
+from gdpro_sim.device import beside_torch
 from gdpro_sim.splatting.checks import check_tensor
 from gdpro_sim.splatting.compositing import Composite
 
@@ -39,7 +39,7 @@ def contributions(meta: dict[str, Any], values: torch.Tensor | None = None) -> t
     sums = [like.new_zeros((len(meta["projection"].records), 0))]
     for first in range(0, channels, GROUP):
         part = shown[..., first : first + GROUP]
-        with torch_stream(like):
+        with beside_torch(like):
             sums.append(weigh(part.reshape(-1, part.shape[-1]).contiguous()))
     both = torch.cat(sums, dim=1).view(cameras, -1, channels)
     return both[..., 0] if values is None else both

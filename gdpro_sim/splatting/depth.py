@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked, torch_stream
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import depth as kernels
 from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.images import check_alike, check_images
@@ -86,7 +86,7 @@ class _Normals(torch.autograd.Function):
         inputs, indices = _spans(depth, viewmats, Ks)
         inputs.append(array(weights.view(-1), wp.float32))
         outputs = [array(normals.view(-1), wp.float32)]
-        with torch_stream(depth):
+        with beside_torch(depth):
             launch_chunked(
                 kernels.depth_normals, indices, inputs, outputs, device=device_name(depth), minimum=32
             )
@@ -102,7 +102,7 @@ class _Normals(torch.autograd.Function):
         g_cameras = depth.new_empty((indices if with_cameras else 0, kernels.CAMERA_GRADIENTS))
         g_depth = buffers.empty_like(depth)
         device = device_name(depth)
-        with torch_stream(depth):
+        with beside_torch(depth):
             given = [
                 array(weights.view(-1), wp.float32),
                 array(gradients[0].contiguous().view(-1), wp.float32),

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from gdpro_sim.device import device_name, launch_chunked, torch_stream
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import projection as kernels
 from gdpro_sim.kernels import projection_backward
 from gdpro_sim.kernels.projection import vec4s
@@ -190,7 +190,7 @@ class _Project(torch.autograd.Function):
         g_records, g_means2d = gradients[:2]
         if g_records is None and g_means2d is None:
             return (None,) * 10
-        with torch_stream(ctx.saved_tensors[0]):
+        with beside_torch(ctx.saved_tensors[0]):
             return _project_backward(ctx, g_records, g_means2d)
 
 

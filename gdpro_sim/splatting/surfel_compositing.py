@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked, serial_torch, torch_stream
+from gdpro_sim.device import beside_torch, device_name, launch_chunked, serial_torch
 from gdpro_sim.kernels import surfel_compositing as kernels
 from gdpro_sim.kernels import surfel_compositing_backward
 from gdpro_sim.kernels.projection import TILE
@@ -205,7 +205,7 @@ class _Blend(torch.autograd.Function):
             rest[1] = image.new_empty((0, 3))
         blending: SurfelBlending = ctx.blending
         geometry = blending.depth or any(gradient is not None for gradient in given[2:])
-        with torch_stream(records):
+        with beside_torch(records):
             sums = gradient_sums(
                 records, channels, ctx.lists, rects, stops, images, [g_image, *rest], blending, geometry
             )
@@ -297,7 +297,7 @@ def weigh_surfels(
         torch.empty(0, dtype=torch.int32, device=values.device),
     ]
     only = SurfelBlending(blending.view, count, False, False, False, blending.tile, False)
-    with torch_stream(values):
+    with beside_torch(values):
         sums = gradient_sums(
             records,
             None,

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import device_name, launch_chunked, torch_stream
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import surfels as kernels
 from gdpro_sim.kernels import surfels_backward
 from gdpro_sim.kernels.projection import vec4s
@@ -141,7 +141,7 @@ class _Project(torch.autograd.Function):
         groups_per_run = 64 if lanes > 1 or with_cameras else 1
         runs = -(-groups // groups_per_run)
         g_cameras = means.new_zeros((runs if with_cameras else 0, cameras, CAMERA_GRADIENTS))
-        with torch_stream(means):
+        with beside_torch(means):
             launch_chunked(
                 surfels_backward.project_surfels_backward,
                 runs,

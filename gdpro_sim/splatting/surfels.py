@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gdpro_sim.device import torch_stream
+from gdpro_sim.device import beside_torch
 from gdpro_sim.splatting.batches import batched
 from gdpro_sim.splatting.checks import (
     check_choice,
@@ -143,7 +143,7 @@ def rasterization_2dgs(
 
     drawn, degree = (colors, sh_degree) if with_colors else (means.new_empty((count, 0)), None)
     flat = drawn if degree is not None else drawn.flatten(0, -2)
-    with torch_stream(means):
+    with beside_torch(means):
         projection, lists = _project_and_bin(
             (means, quats, scales, opacities), flat, degree, view, options.max_tile_entries, tile=tile
         )

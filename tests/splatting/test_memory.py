@@ -14,7 +14,7 @@ SCRIPT = """
 import json, resource, sys
 import torch
 from gdpro_sim.splatting import rasterization
-from tests.benchmarks.bench_splatting import bumpy_sphere, front_camera
+from tests.benchmarks.splatting_scene import bumpy_sphere, front_camera
 
 count, size, degree = map(int, sys.argv[1:])
 
