@@ -173,7 +173,7 @@ class _Project(torch.autograd.Function):
                 array(order, wp.int32),
             ],
             device=device_name(means),
-            minimum=64,
+            minimum=256,
         )
         for camera in range(cameras if count > 0 else 0):
             sort_pairs(keys[camera], order[camera], count)
@@ -250,7 +250,7 @@ def _project_backward(
             array(g_cameras, wp.float32),
         ],
         device=device_name(means),
-        minimum=1,
+        minimum=4,
     )
     if cameras == 0:
         for gradient in (g_means, g_quats, g_scales, g_opacities, g_sh, g_features):

@@ -17,6 +17,12 @@ from gdpro_sim.splatting.tiles import TileLists
 TILE_WORK = 32
 """What a tile costs beside its entries, in entries."""
 
+SMALLEST_PIECE = 32
+"""Tiles worth a launch of their own."""
+
+SMALLEST_MERGE = 1 << 15
+"""Entries whose spills are worth merging on several threads."""
+
 
 def balanced_slabs(begins: torch.Tensor, ends: torch.Tensor, slabs: int) -> list[int]:
     """Bounds [slabs + 1] of runs of tiles with about equally many entries, begins[t] .. ends[t] - 1."""
@@ -31,7 +37,7 @@ def launch_tiles(kernel: wp.Kernel, offsets: torch.Tensor, arguments: list[Any])
     threads, tiles = thread_count(), len(offsets) - 1
     if tiles == 0:
         return
-    pieces = 1 if threads == 1 else min(PIECES * threads, tiles)
+    pieces = 1 if threads == 1 else min(PIECES * threads, -(-tiles // SMALLEST_PIECE))
     if pieces > 1:
         wp.load_module(kernel.module, device="cpu")
     bounds = balanced_slabs(offsets[:-1], offsets[1:], pieces)
@@ -89,12 +95,13 @@ def add_over_tiles(
                 wp.launch(kernel, dim=end - begin, inputs=whole, device="cpu")
 
     run_chunks(run, slabs)
-    spilled = [slabs, array(lists.offsets, wp.int32), *spills_array, sums_array]
+    parts = slabs if entries >= SMALLEST_MERGE else 1
+    spilled = [parts, array(lists.offsets, wp.int32), *spills_array, sums_array]
 
     def merge(first: int, last: int) -> None:
         wp.launch(kernels.merge_spills, dim=last - first, inputs=[first, *spilled], device="cpu")
 
-    run_chunks(merge, slabs)
+    run_chunks(merge, parts)
     return sums
 
 

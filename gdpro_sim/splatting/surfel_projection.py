@@ -106,7 +106,7 @@ class _Project(torch.autograd.Function):
                 array(order, wp.int32),
             ],
             device=device_name(means),
-            minimum=64,
+            minimum=256,
         )
         for camera in range(cameras):
             sort_pairs(keys[camera], order[camera], count)
@@ -171,7 +171,7 @@ class _Project(torch.autograd.Function):
                     array(g_cameras, wp.float32),
                 ],
                 device=device_name(means),
-                minimum=1,
+                minimum=4,
             )
         g_viewmats, g_Ks = camera_gradients(g_cameras) if with_cameras else (None, None)
         return g_means, g_quats, g_scales, g_opacities, g_sh, g_features, g_viewmats, g_Ks, None, None
