@@ -15,6 +15,7 @@ Up to four channels are blended at once; more channels run again over the same l
 
 import warp as wp
 
+from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, TRANSPOSE
 from gdpro_sim.kernels.projection import (
     BOX,
@@ -27,7 +28,6 @@ from gdpro_sim.kernels.projection import (
     RECORD,
     TILE,
 )
-from gdpro_sim.kernels.images import IMAGES
 
 wp.set_module_options(
     {

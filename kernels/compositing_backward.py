@@ -27,6 +27,7 @@ from gdpro_sim.kernels.compositing import (
     POWER,
     TILE_LANES,
 )
+from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
 from gdpro_sim.kernels.projection import (
     BOX,
@@ -39,7 +40,6 @@ from gdpro_sim.kernels.projection import (
     vec4s,
 )
 from gdpro_sim.kernels.slabs import IN_SLAB
-from gdpro_sim.kernels.images import IMAGES
 
 wp.set_module_options(
     {

@@ -240,6 +240,9 @@ _PROJECT = f"""
     fields[{COMPENSATION}] = compensation;
     float* const record = records_out.data + first * 16;
     for (int i = 0; i < 16; ++i) fields[i] = select(drawn, fields[i], zero);
+    float* const mean2d = (float*)(means2d_out.data + first);
+    store(mean2d, 2, fields[{MEAN}]);
+    store(mean2d + 1, 2, fields[{MEAN + 1}]);
     store_rows(record, 16, fields);
 {BIN}"""
 
@@ -265,6 +268,7 @@ def project_group(
     eps2d: float,
     antialiased: bool,
     records_out: wp.array2d[float],
+    means2d_out: wp.array[wp.vec2],
     radii_out: wp.array[wp.vec2i],
     rects_out: wp.array[vec4s],
     keys_out: wp.array2d[float],
@@ -295,6 +299,7 @@ def project(
     antialiased: bool,
     # Out:
     records_out: wp.array2d[float],
+    means2d_out: wp.array[wp.vec2],
     radii_out: wp.array[wp.vec2i],
     rects_out: wp.array[vec4s],
     keys_out: wp.array2d[float],
@@ -325,6 +330,7 @@ def project(
         eps2d,
         antialiased,
         records_out,
+        means2d_out,
         radii_out,
         rects_out,
         keys_out,

@@ -138,6 +138,7 @@ class _Project(torch.autograd.Function):
         cameras, count = len(viewmats), len(means)
         total = cameras * count
         records = buffers.empty((total, int(kernels.RECORD)), means.dtype, means.device)
+        means2d = buffers.empty((cameras, count, 2), means.dtype, means.device)
         radii = buffers.empty((total, 2), torch.int32, means.device)
         rects = buffers.empty((total, 4), torch.int16, means.device)
         keys = buffers.empty((cameras, 2 * count), torch.float32, means.device)
@@ -167,6 +168,7 @@ class _Project(torch.autograd.Function):
             ],
             [
                 array(records, wp.float32),
+                array(means2d.view(total, 2), wp.vec2),
                 array(radii, wp.vec2i),
                 array(rects, vec4s),
                 array(keys, wp.float32),
@@ -177,7 +179,6 @@ class _Project(torch.autograd.Function):
         )
         for camera in range(cameras if count > 0 else 0):
             sort_pairs(keys[camera], order[camera], count)
-        means2d = records.view(cameras, count, int(kernels.RECORD))[..., :2].contiguous()
         ctx.save_for_backward(means, quats, scales, opacities, sh, features, viewmats, Ks, rects)
         ctx.degree, ctx.view = degree, view
         ctx.mark_non_differentiable(radii, rects, order)
