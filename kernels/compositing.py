@@ -332,14 +332,77 @@ def composite_tile(
     )
 
 
-@wp.func
-def log2_alpha(records: wp.array2d[float], i: int, px: float, py: float) -> float:
-    """Base-2 logarithm of a Gaussian's alpha at a pixel position, before the 0.99 limit."""
-    dx = px - records[i, MEAN]
-    dy = py - records[i, MEAN + 1]
-    u = records[i, FACTOR] * dx + records[i, FACTOR + 1] * dy
-    v = records[i, FACTOR + 2] * dy
-    return records[i, LOG2_OPACITY] - u * u - v * v
+PIXEL_ALPHA = f"""
+        const size_t g = (size_t)ids.data[at];
+        const float* const r = records.data + g * {RECORD};
+        const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
+        const float u = fmaf(r[{FACTOR}], dx, r[{FACTOR + 1}] * dy), v = r[{FACTOR + 2}] * dy;
+        const float p = fmaf(-v, v, fmaf(-u, u, r[{LOG2_OPACITY}]));
+"""
+"""Snippet: entry `at` at pixel x, y -> its record r, offset dx, dy, u, v and base-2 logarithm p of alpha."""
+
+PIXEL_WEIGHT = f"""
+            const float raw = exp2f(p);
+            const float alpha = raw < {float(ALPHA_MAX)!r}f ? raw : {float(ALPHA_MAX)!r}f;
+            const float next = fmaf(-alpha, T, T);
+"""
+"""Snippet: p and transmittance T -> alpha, and the transmittance behind."""
+
+_PIXEL = f"""
+{LOCATE_PIXEL}
+    if (!inside) return;
+    const int end = offsets.data[tile + 1];
+    const float* const colour = channels.data + channel_offset;
+    const int channel_stride = channels.shape[1];
+    float T = 1.0f, c0 = 0.0f, c1 = 0.0f, c2 = 0.0f, c3 = 0.0f;
+    int last = begin;
+    for (int at = begin; at < end; ++at) {{
+{PIXEL_ALPHA}
+        if (p >= {float(LOG2_CUTOFF)!r}f) {{
+{PIXEL_WEIGHT}
+            if (next <= {float(TRANSMITTANCE_MIN)!r}f) break;
+            const float* const c = colour + g * channel_stride;
+            const float w = alpha * T;
+            c0 = fmaf(w, c[0], c0);
+            c1 = fmaf(w, c[1], c1);
+            c2 = fmaf(w, c[2], c2);
+            c3 = fmaf(w, c[3], c3);
+            T = next;
+            last = at + 1;
+        }}
+    }}
+    const float alpha = 1.0f - T;
+    const float* const background = backgrounds.data + (size_t)camera * count;
+    float* const out = image_out.data + pixel * count;
+    auto write = [&](int i, float sum) {{
+        if (i >= count) return;
+        out[i] = i == divided ? sum / (alpha > 1e-10f ? alpha : 1e-10f) : fmaf(T, background[i], sum);
+    }};
+    write(0, c0), write(1, c1), write(2, c2), write(3, c3);
+    alphas_out.data[pixel] = alpha;
+    transmittance_out.data[pixel] = T;
+    last_out.data[pixel] = last;
+"""
+
+
+@wp.func_native(_PIXEL)
+def blend_pixel(
+    index: int,
+    records: wp.array2d[float],
+    channels: wp.array2d[float],
+    channel_offset: int,
+    offsets: wp.array[int],
+    ids: wp.array[int],
+    backgrounds: wp.array2d[float],
+    width: int,
+    height: int,
+    count: int,
+    divided: int,
+    image_out: wp.array2d[float],
+    alphas_out: wp.array[float],
+    transmittance_out: wp.array[float],
+    last_out: wp.array[int],
+): ...
 
 
 @wp.kernel
@@ -364,44 +427,22 @@ def composite_pixel(
 ):
     """The same for one pixel: index / 256 is the tile, index % 256 the pixel in it.
 
-    `last_out` holds the list position after the last Gaussian blended.
+    `last_out` holds the list position after the last Gaussian blended. Channels come in rows of four or more.
     """
-    i = start + wp.tid()
-    tile = i / (TILE * TILE)
-    in_tile = i - tile * (TILE * TILE)
-    tiles_x = (width + TILE - 1) / TILE
-    tiles_y = (height + TILE - 1) / TILE
-    camera = tile / (tiles_x * tiles_y)
-    in_camera = tile - camera * tiles_x * tiles_y
-    x = in_camera % tiles_x * TILE + in_tile % TILE
-    y = in_camera / tiles_x * TILE + in_tile / TILE
-    if x >= width or y >= height:
-        return
-
-    transmittance = wp.float32(1.0)
-    blended = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    begin = offsets[tile]
-    last = wp.int32(begin)
-    for at in range(begin, offsets[tile + 1]):
-        g = ids[at]
-        power = log2_alpha(records, g, float(x) + 0.5, float(y) + 0.5)
-        if power >= LOG2_CUTOFF:
-            alpha = wp.min(wp.exp(LN2 * power), ALPHA_MAX)
-            weight = alpha * transmittance
-            if transmittance - weight <= TRANSMITTANCE_MIN:
-                break
-            for j in range(count):
-                blended[j] += weight * channels[g, channel_offset + j]
-            transmittance -= weight
-            last = at + 1
-
-    pixel = (camera * height + y) * width + x
-    alpha = 1.0 - transmittance
-    for j in range(count):
-        value = blended[j] + transmittance * backgrounds[camera, j]
-        if j == divided:
-            value = blended[j] / wp.max(alpha, 1.0e-10)
-        image_out[pixel, j] = value
-    alphas_out[pixel] = alpha
-    transmittance_out[pixel] = transmittance
-    last_out[pixel] = last
+    blend_pixel(
+        start + wp.tid(),
+        records,
+        channels,
+        channel_offset,
+        offsets,
+        ids,
+        backgrounds,
+        width,
+        height,
+        count,
+        divided,
+        image_out,
+        alphas_out,
+        transmittance_out,
+        last_out,
+    )

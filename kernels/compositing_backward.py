@@ -24,6 +24,8 @@ from gdpro_sim.kernels.compositing import (
     LOCATE_PIXEL,
     LOCATE_TILE,
     PASS,
+    PIXEL_ALPHA,
+    PIXEL_WEIGHT,
     POWER,
     TILE_LANES,
 )
@@ -51,7 +53,6 @@ wp.set_module_options(
 )
 
 SPILL = """
-        // Lane i of `sum` belongs to number i of the Gaussian's gradient.
         float* out;
         if (whole || in_slab((int)g)) {
             out = sums_out.data + g * WIDTH;
@@ -63,24 +64,6 @@ SPILL = """
         }
 """
 """CPU snippet: Gaussian `g` -> where its sums of this tile go (see `gdpro_sim.kernels.slabs`)."""
-
-_PIXEL_GRADIENT = """
-                // An expected depth s / alpha counts as s with a gradient at alpha of its own.
-                float behind = 0.0f, on_alpha = g_alphas.data ? g_alphas.data[pixel] : 0.0f;
-                for (int i = 0; i < count; ++i) {
-                    float g = g_image.data[pixel * count + i];
-                    const float value = image.data[pixel * count + i];
-                    behind += value * g;
-                    if (i == divided) {
-                        const float alpha = 1.0f - transmittance.data[pixel];
-                        if (alpha > 1e-10f) on_alpha -= g * value / alpha;
-                        g /= alpha > 1e-10f ? alpha : 1e-10f;
-                    }
-                    gradient[i] = g;
-                }
-                behind -= transmittance.data[pixel] * on_alpha;
-"""
-"""Snippet: `pixel` -> gradient[i] at its sums and `behind`, the first R."""
 
 _BATCH = (
     BATCH.replace("{declare}", "I reached = (I)0;")
@@ -184,9 +167,11 @@ _TILE = f"""
                 -fma((F)dx, sum_u, sum_ux), -fma((F)dy, sum_u, sum_uy), -fma((F)dy, sum_v, sum_vy),
                 zero, 0.5f * sum_p, zero, sum_0, sum_1, sum_2, sum_3, abs_x, abs_y, zero, zero,
             }};
+            // In two statements, so that no compiler rounds once here and twice where spills are merged.
+            const F added = sum_lanes(sums) * factors;
             F total;
             __builtin_memcpy(&total, out, 64);
-            total += sum_lanes(sums) * factors;
+            total += added;
             __builtin_memcpy(out, &total, 64);
         }}
         at += held;
@@ -303,36 +288,47 @@ WARP_SUMS = """
 
 _PIXEL = f"""
 {LOCATE_PIXEL}{WARP_SUMS}
-    float gradient[4] = {{0.0f, 0.0f, 0.0f, 0.0f}}, R = 0.0f, T = 1.0f;
+    // The image's gradient at the sums, zero past the last channel, and R.
+    float g0 = 0.0f, g1 = 0.0f, g2 = 0.0f, g3 = 0.0f, R = 0.0f, T = 1.0f;
     if (inside) {{
-{_PIXEL_GRADIENT}
-        R = behind;
+        const float left = transmittance.data[pixel];
+        const float alpha = 1.0f - left > 1e-10f ? 1.0f - left : 1e-10f;
+        float on_alpha = g_alphas.data ? g_alphas.data[pixel] : 0.0f;
+        auto read = [&](int i) {{
+            if (i >= count) return 0.0f;
+            const float value = image.data[pixel * count + i];
+            float gradient = g_image.data[pixel * count + i];
+            R += value * gradient;
+            if (i == divided) {{
+                // An expected depth s / alpha counts as s with a gradient at alpha of its own.
+                gradient /= alpha;
+                if (alpha > 1e-10f) on_alpha -= gradient * value;
+            }}
+            return gradient;
+        }};
+        g0 = read(0), g1 = read(1), g2 = read(2), g3 = read(3);
+        R -= left * on_alpha;
     }}
     const int last = inside ? stops.data[pixel] : begin;
     const int end = warp_max(last);
+    const float* const colour = channels.data + channel_offset;
+    const int channel_stride = channels.shape[1];
     for (int at = begin; at < end; ++at) {{
-        const size_t g = (size_t)ids.data[at];
-        const float* const r = records.data + g * {RECORD};
-        const float* const c = channels.data + g * channels.shape[1] + channel_offset;
-        const float a = r[{FACTOR}], b = r[{FACTOR + 1}], d = r[{FACTOR + 2}];
-        const float dx = (float)x + 0.5f - r[{MEAN}], dy = (float)y + 0.5f - r[{MEAN + 1}];
-        const float u = a * dx + b * dy, v = d * dy;
-        const float p = r[{LOG2_OPACITY}] - u * u - v * v;
+{PIXEL_ALPHA}
         const bool blend = at < last && p >= {float(LOG2_CUTOFF)!r}f;
         if (!warp_any(blend)) continue;
         float w = 0.0f, g_p = 0.0f;
         if (blend) {{
-            const float raw = expf({float(LN2)!r}f * p);
-            const float alpha = raw < {float(ALPHA_MAX)!r}f ? raw : {float(ALPHA_MAX)!r}f;
+{PIXEL_WEIGHT}
+            const float* const c = colour + g * channel_stride;
             w = alpha * T;
-            float q = 0.0f;
-            for (int i = 0; i < count; ++i) q += c[i] * gradient[i];
+            const float q = c[0] * g0 + c[1] * g1 + c[2] * g2 + c[3] * g3;
             R -= w * q;
             if (raw <= {float(ALPHA_MAX)!r}f) g_p = (T * q - R / (1.0f - alpha)) * raw * {2 * LN2!r}f;
-            T -= w;
+            T = next;
         }}
         const float g_u = g_p * u, g_v = g_p * v;
-        const float g_x = a * g_u, g_y = b * g_u + d * g_v;
+        const float g_x = r[{FACTOR}] * g_u, g_y = r[{FACTOR + 1}] * g_u + r[{FACTOR + 2}] * g_v;
         float* const out = sums_out.data + g * {RECORD};
         warp_add(out + {MEAN}, g_x);
         warp_add(out + {MEAN + 1}, g_y);
@@ -340,7 +336,10 @@ _PIXEL = f"""
         warp_add(out + {FACTOR + 1}, -g_u * dy);
         warp_add(out + {FACTOR + 2}, -g_v * dy);
         warp_add(out + {LOG2_OPACITY}, 0.5f * g_p);
-        for (int i = 0; i < count; ++i) warp_add(out + {CHANNELS} + i, w * gradient[i]);
+        warp_add(out + {CHANNELS}, w * g0);
+        if (count > 1) warp_add(out + {CHANNELS + 1}, w * g1);
+        if (count > 2) warp_add(out + {CHANNELS + 2}, w * g2);
+        if (count > 3) warp_add(out + {CHANNELS + 3}, w * g3);
         if (absolute) {{
             warp_add(out + {BOX}, fabsf(g_x));
             warp_add(out + {BOX + 1}, fabsf(g_y));

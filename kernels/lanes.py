@@ -1,9 +1,8 @@
 """C++ text shared by the native snippets of the splatting kernels: vectors of pixel or Gaussian lanes.
 
-`PRELUDE` opens a snippet. It defines a float vector `F` and an int vector `I` of `LANES` lanes,
-    16 on a CPU and
-one on a GPU, and the functions below, so that the same text works on 16 Gaussians at once on a CPU and on one
-per thread on a GPU. The snippet must declare `const int lanes` before: how many of the lanes hold something.
+`PRELUDE` opens a snippet. It defines a float vector `F` and an int vector `I` of `LANES` lanes, 16 on a CPU
+and one on a GPU, and the functions below, so that the same text works on 16 Gaussians at once on a CPU and on
+one per thread on a GPU. The snippet must declare `const int lanes` before: how many lanes hold something.
 
     load(p, stride)        lane j from p[j stride]; lanes past the last repeat it
     store(p, stride, v)    lane j to p[j stride], where j < lanes
@@ -14,6 +13,7 @@ per thread on a GPU. The snippet must declare `const int lanes` before: how many
     store3(p, in), store4(p, in)   the other way
     splat(x)               x in all lanes
     sqrt_(v), min_(v, w), max_(v, w), abs_(v), floor_(v), ceil_(v), log2_(v)
+    to_int(v), to_float(i), bits_of(v), of_bits(i)   by value, and by bits
     select(mask, v, w)     v where the mask is set, else w
     finite(v)              mask
     total(v)               sum of all lanes that hold something
@@ -131,8 +131,6 @@ PRELUDE = (
     auto store3 = [&](float* p, const F* in) { for (int i = 0; i < 3; ++i) p[i] = in[i]; };
     auto store4 = [&](float* p, const F* in) { for (int i = 0; i < 4; ++i) p[i] = in[i]; };
     auto splat = [](float x) { return x; };
-    auto lane = [](F v, int) { return v; };
-    auto lane_int = [](I v, int) { return v; };
     auto to_int = [](F v) { return (int)v; };
     auto to_float = [](I v) { return (float)v; };
     auto bits_of = [](F v) { return __float_as_int(v); };
@@ -183,8 +181,6 @@ PRELUDE = (
     + _packed(4)
     + """
     auto splat = [](float x) { return (F)x; };
-    auto lane = [](F v, int j) { return v[j]; };
-    auto lane_int = [](I v, int j) { return v[j]; };
     auto to_int = [](F v) { return __builtin_convertvector(v, I); };
     auto to_float = [](I v) { return __builtin_convertvector(v, F); };
     auto bits_of = [](F v) { I b; __builtin_memcpy(&b, &v, 64); return b; };

@@ -24,6 +24,7 @@ from gdpro_sim.kernels.surfels import (
     NORMAL,
     RECORD,
     SLOPE,
+    STEEPEST,
     SURFEL,
     U,
     V,
@@ -81,7 +82,9 @@ _BACKWARD = f"""
         write(g_opacities_out.data + n, 1, g[{LOG2_OPACITY}] / (load(opacities.data + n, 1) * {LN2!r}f));
 
         // U, V and SLOPE -> images of the tangents, z and scales.
-        const F g_pu = g[{U}] * iby - g[{U + 1}] * ibx, g_pv = g[{V + 1}] * iax - g[{V}] * iay;
+        // What is limited does not depend on what it was before.
+        const F g_pu = select(abs_(pu) < {STEEPEST!r}f, g[{U}] * iby - g[{U + 1}] * ibx, zero);
+        const F g_pv = select(abs_(pv) < {STEEPEST!r}f, g[{V + 1}] * iax - g[{V}] * iay, zero);
         const F wax = g[{SLOPE}] * inverse_area, way = g[{SLOPE + 1}] * inverse_area;
         F g_iay = wax * bz - g[{V}] * pv, g_iax = g[{V + 1}] * pv - way * bz;
         F g_iby = g[{U}] * pu - wax * az, g_ibx = way * az - g[{U + 1}] * pu;

@@ -31,6 +31,8 @@ def batched(render: Render) -> Render:
             return render(*args, **kwargs)
         bound = signature.bind(*args, **kwargs)
         axes = means.shape[:-2]
+        if math.prod(axes) == 0:
+            raise ValueError(f"means must hold at least one scene, got shape {list(means.shape)}")
         flat = {}
         for name in BATCHED:
             value = bound.arguments.get(name)
@@ -39,14 +41,12 @@ def batched(render: Render) -> Render:
             if not isinstance(value, torch.Tensor) or value.shape[: len(axes)] != axes:
                 got = list(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
                 raise ValueError(f"{name} must begin with the batch axes of means, {list(axes)}, got {got}")
-            flat[name] = value.reshape(-1, *value.shape[len(axes) :])
+            flat[name] = value.reshape(math.prod(axes), *value.shape[len(axes) :])
         results = []
         for i in range(math.prod(axes)):
             call = {**bound.arguments, **{name: value[i] for name, value in flat.items()}}
             extra = call.pop(_extra(signature), {})
             results.append(render(**call, **extra))
-        if not results:
-            raise ValueError(f"means must hold at least one scene, got shape {list(means.shape)}")
         images = [
             None if parts[0] is None else torch.stack(list(parts)).reshape(*axes, *parts[0].shape)
             for parts in zip(*(result[:-1] for result in results), strict=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import threading
 import weakref
-from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,8 +22,8 @@ LARGEST_SUM = 1 << 29
 
 ALIGNMENT = 64
 
-_lock = threading.RLock()
-_free: defaultdict[int, list[np.ndarray]] = defaultdict(list)
+_lock = threading.RLock()  # memory may come back inside, when garbage is collected
+_free: list[np.ndarray] = []
 _free_bytes = 0
 
 
@@ -52,21 +51,22 @@ def _take(size: int) -> np.ndarray:
     step = 1 << max(size.bit_length() - 4, 12)
     rounded = -(-size // step) * step + ALIGNMENT
     with _lock:
-        if _free[rounded]:
-            _free_bytes -= rounded
-            return _free[rounded].pop()
+        for i in range(len(_free) - 1, -1, -1):
+            if _free[i].nbytes == rounded:
+                _free_bytes -= rounded
+                return _free.pop(i)
     return np.empty(rounded, dtype=np.uint8)
 
 
 def _give_back(block: np.ndarray) -> None:
     global _free_bytes
     with _lock:
-        if _free_bytes + block.nbytes > LARGEST_SUM:
-            _free.clear()
-            _free_bytes = 0
-        if block.nbytes <= LARGEST_SUM:
-            _free[block.nbytes].append(block)
-            _free_bytes += block.nbytes
+        if block.nbytes > LARGEST_SUM:
+            return
+        _free.append(block)
+        _free_bytes += block.nbytes
+        while _free_bytes > LARGEST_SUM:  # the one unused for longest goes first
+            _free_bytes -= _free.pop(0).nbytes
 
 
 def free_bytes() -> int:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
+from typing import SupportsIndex
 
 import torch
 
@@ -45,9 +47,9 @@ def check_number(name: str, value: object, minimum: float) -> float:
 
 def check_size(name: str, value: object) -> int:
     """Return an image size in pixels >= 1. Raises ValueError."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, SupportsIndex) or operator.index(value) < 1:
         raise ValueError(f"{name} must be a whole number of pixels >= 1, got {value!r}")
-    return value
+    return operator.index(value)
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
@@ -103,11 +105,16 @@ GSPLAT_ARGUMENTS: dict[str, tuple[object, ...]] = {
     "covars": (None,),
     "with_ut": (False,),
     "with_eval3d": (False,),
+    "radial_coeffs": (None,),
+    "tangential_coeffs": (None,),
+    "thin_prism_coeffs": (None,),
+    "ftheta_coeffs": (None,),
+    "viewmats_rs": (None,),
 }
 """gsplat's arguments that have one meaning here, and the values that ask for it."""
 
 
-def check_gsplat_arguments(arguments: dict[str, object]) -> None:
+def check_gsplat_arguments(function: str, arguments: dict[str, object]) -> None:
     """Accept gsplat's other arguments where they ask for what is done anyway.
 
     Raises ValueError where they ask for something else, TypeError where gsplat has no such argument.
@@ -115,8 +122,10 @@ def check_gsplat_arguments(arguments: dict[str, object]) -> None:
     for name, value in arguments.items():
         if name == "channel_chunk":  # how many channels at once changes no result
             continue
+        if name == "rolling_shutter" and getattr(value, "name", value) == "GLOBAL":
+            continue
         if name not in GSPLAT_ARGUMENTS:
-            raise TypeError(f"rasterization got an unexpected argument {name!r}")
+            raise TypeError(f"{function} got an unexpected argument {name!r}")
         if not any(type(value) is type(allowed) and value == allowed for allowed in GSPLAT_ARGUMENTS[name]):
             allowed = " or ".join(repr(a) for a in GSPLAT_ARGUMENTS[name])
             raise ValueError(f"{name} must be {allowed}, the only choice here, got {value!r}")

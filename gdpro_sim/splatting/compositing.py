@@ -235,7 +235,13 @@ def gradient_sums(
     ]
     if blending.tile:
         return add_over_tiles(
-            compositing_backward.composite_tile_backward, inputs, lists, stops, rects, int(RECORD)
+            compositing_backward.composite_tile_backward,
+            inputs,
+            lists,
+            stops,
+            rects,
+            view.tiles[0],
+            int(RECORD),
         )
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.

@@ -27,6 +27,8 @@ def contributions(meta: dict[str, Any], values: torch.Tensor | None = None) -> t
     divided by the former, the mean of what the Gaussian shows. Zero for Gaussians that are not drawn, or that
     are hidden. Without gradients. Raises ValueError where `values` does not fit.
     """
+    if "batches" in meta:
+        raise ValueError('meta has batch axes: ask for each of meta["batches"]')
     result: Composite = meta["composite"]
     weigh: Weigh = meta["weigh"]
     cameras, height, width = result.transmittance.shape
@@ -41,7 +43,7 @@ def contributions(meta: dict[str, Any], values: torch.Tensor | None = None) -> t
         part = shown[..., first : first + GROUP]
         with beside_torch(like):
             sums.append(weigh(part.reshape(-1, part.shape[-1]).contiguous()))
-    both = torch.cat(sums, dim=1).view(cameras, -1, channels)
+    both = torch.cat(sums, dim=1).view(cameras, meta["projection"].gaussians, channels)
     return both[..., 0] if values is None else both
 
 

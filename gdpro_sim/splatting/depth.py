@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import depth as kernels
@@ -94,6 +95,7 @@ class _Normals(torch.autograd.Function):
         return normals
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         depth, viewmats, Ks, weights = ctx.saved_tensors
         inputs, indices = _spans(depth, viewmats, Ks)

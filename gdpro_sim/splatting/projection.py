@@ -38,22 +38,22 @@ class View:
 
 
 @dataclass(frozen=True)
-class Projection:
-    """C x N projected Gaussians; M = C N, record c N + n is Gaussian n seen by camera c.
+class Projected:
+    """C x N projected Gaussians or surfels; M = C N, record c N + n is number n seen by camera c.
 
-    records: [M, 16] float32, see `gdpro_sim.kernels.projection`; zeros where culled. Its depths, opacities,
-             factors and channels carry gradients; its means do not: `means2d` does
+    records: [M, R] float32, zeros where culled. All but its means carry gradients: `means2d` does
     means2d: [C, N, 2] pixels
     radii:   [M, 2] int32, half extents in pixels of the box outside which alpha < 1/255; zeros where culled
     rects:   [M, 4] int16, tiles touched: x begin, y begin, x end, y end (exclusive); zeros where culled
-    order:   [C, 2 N] int32, of which order[:, :N] are record numbers in ascending depth, culled ones last
+    order:   [C, 2 N] int32, of which order[:, :N] are record numbers in ascending depth, culled ones last;
+             None once the tile lists are made
     """
 
     records: torch.Tensor
     means2d: torch.Tensor
     radii: torch.Tensor
     rects: torch.Tensor
-    order: torch.Tensor
+    order: torch.Tensor | None
 
     @property
     def cameras(self) -> int:
@@ -64,7 +64,13 @@ class Projection:
         return int(self.means2d.shape[1])
 
     def _field(self, first: int, width: int) -> torch.Tensor:
-        return self.records.view(self.cameras, self.gaussians, kernels.RECORD)[..., first : first + width]
+        whole = self.records.shape[1]
+        return self.records.view(self.cameras, self.gaussians, whole)[..., first : first + width]
+
+
+@dataclass(frozen=True)
+class Projection(Projected):
+    """3D Gaussians projected. records: [M, 16], see `gdpro_sim.kernels.projection`."""
 
     @property
     def depths(self) -> torch.Tensor:
@@ -141,8 +147,8 @@ class _Project(torch.autograd.Function):
         means2d = buffers.empty((cameras, count, 2), means.dtype, means.device)
         radii = buffers.empty((total, 2), torch.int32, means.device)
         rects = buffers.empty((total, 4), torch.int16, means.device)
-        keys = buffers.empty((cameras, 2 * count), torch.float32, means.device)
-        order = buffers.empty((cameras, 2 * count), torch.int32, means.device)
+        keys = torch.empty((cameras, 2 * count), device=means.device)
+        order = torch.empty((cameras, 2 * count), dtype=torch.int32, device=means.device)
         lanes = lanes_of(means)
         launch_chunked(
             kernels.project,
@@ -273,4 +279,13 @@ def camera_gradients(sums: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return g_viewmats, g_Ks
 
 
-__all__ = ["Projection", "View", "array", "camera_gradients", "lanes_of", "project", "sort_pairs"]
+__all__ = [
+    "Projected",
+    "Projection",
+    "View",
+    "array",
+    "camera_gradients",
+    "lanes_of",
+    "project",
+    "sort_pairs",
+]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -129,7 +129,7 @@ def rasterization(
     from Zwicker et al., "EWA Splatting" (2002); antialiasing from Yu et al., "Mip-Splatting" (2024), eq. 9.
     """
     options = RasterOptions() if options is None else options
-    check_gsplat_arguments(gsplat)
+    check_gsplat_arguments("rasterization", gsplat)
     means = check_tensor("means", means, ("N", 3))
     count = len(means)
     quats = check_tensor("quats", quats, (count, 4), means)
@@ -162,6 +162,7 @@ def rasterization(
     divided = channels - 1 if render_mode.endswith("ED") else -1
 
     columns, rows = view.tiles
+    check_count("Gaussians", count, INDEX_LIMIT // 2)
     check_count("Gaussians times cameras", cameras * count)
     check_count("image values (cameras x height x width x channels)", cameras * height * width * channels)
     check_count("image columns or rows", max(width, height), 16 * 32767)
@@ -224,7 +225,8 @@ def _project_and_bin(
     projection = project(gaussians, colors, degree, view)
     if len(projection.records) == 0:
         return projection, empty_lists(projection.cameras, view, projection.records.device)
-    return projection, (count_and_fill if tile else expand_and_sort)(projection, view, limit)
+    lists = (count_and_fill if tile else expand_and_sort)(projection, view, limit)
+    return replace(projection, order=None), lists
 
 
 __all__ = ["RasterOptions", "rasterization"]

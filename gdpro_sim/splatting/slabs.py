@@ -20,6 +20,9 @@ TILE_WORK = 32
 SMALLEST_PIECE = 32
 """Tiles worth a launch of their own."""
 
+SMALLEST_SLAB = 4
+"""Rows of tiles worth a slab: in fewer nearly every Gaussian would touch another slab, and be spilled."""
+
 SMALLEST_MERGE = 1 << 15
 """Entries whose spills are worth merging on several threads."""
 
@@ -56,6 +59,7 @@ def add_over_tiles(
     lists: TileLists,
     stops: torch.Tensor,
     rects: torch.Tensor,
+    columns: int,
     width: int,
 ) -> torch.Tensor:
     """Sums [M, width] float32 of what the tiles add to each of M Gaussians.
@@ -63,13 +67,13 @@ def add_over_tiles(
     `kernel` runs on a CPU once per tile, with the arguments: first tile of the launch, `inputs`, rects, first
     and end tile of the slab, where each tile's spills begin [tiles + 1], sums [M, width], spill ids [E] and
     spills [E, width]. It must add to the sums where the Gaussian touches tiles of the slab alone, and else
-    write the next of its tile's spills; it may leave out what adds nothing.
+    write the next of its tile's spills; it may leave out what adds nothing. `columns` tiles make a row.
     """
     tiles = len(lists.offsets) - 1
     rects_array = array(rects, vec4s)
     sums = buffers.empty((len(rects), width), torch.float32, rects.device).zero_()
     sums_array = array(sums, wp.float32)
-    slabs = min(thread_count(), tiles)
+    slabs = max(1, min(thread_count(), tiles, int(tiles / (SMALLEST_SLAB * columns))))
     if slabs == 1:
         none = torch.empty(0, dtype=torch.int32)
         spills = torch.empty(0, width)

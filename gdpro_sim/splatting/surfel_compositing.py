@@ -7,8 +7,9 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
-from gdpro_sim.device import beside_torch, device_name, launch_chunked, serial_torch
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import surfel_compositing as kernels
 from gdpro_sim.kernels import surfel_compositing_backward
 from gdpro_sim.kernels.projection import TILE
@@ -192,6 +193,7 @@ class _Blend(torch.autograd.Function):
         return image, alphas, normals, distortion, medians, transmittance, depths, stops
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         given = gradients[:5]
         records, means2d, channels, rects, stops, *images = ctx.saved_tensors
@@ -220,7 +222,7 @@ class _Blend(torch.autograd.Function):
             sums[:, CHANNELS : CHANNELS + GROUP] = 0.0
         g_backgrounds = None
         if ctx.needs_input_grad[3]:
-            with serial_torch():
+            with beside_torch(records):
                 pixels = len(image) // max(1, ctx.cameras)
                 covered = images[1].view(ctx.cameras, pixels, 1) * g_image.view(
                     ctx.cameras, pixels, image.shape[1]
@@ -263,7 +265,13 @@ def gradient_sums(
     ]
     if blending.tile:
         return add_over_tiles(
-            surfel_compositing_backward.surfel_tile_backward, inputs, lists, stops, rects, RECORD
+            surfel_compositing_backward.surfel_tile_backward,
+            inputs,
+            lists,
+            stops,
+            rects,
+            view.tiles[0],
+            RECORD,
         )
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.

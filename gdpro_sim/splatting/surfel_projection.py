@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import surfels as kernels
@@ -14,19 +15,12 @@ from gdpro_sim.kernels import surfels_backward
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.kernels.projection_backward import CAMERA_GRADIENTS
 from gdpro_sim.splatting import buffers
-from gdpro_sim.splatting.projection import Projection, View, array, camera_gradients, lanes_of, sort_pairs
+from gdpro_sim.splatting.projection import Projected, View, array, camera_gradients, lanes_of, sort_pairs
 
 
 @dataclass(frozen=True)
-class SurfelProjection(Projection):
-    """C x N projected surfels, laid out as `Projection` is.
-
-    records: [M, 24] float32, see `gdpro_sim.kernels.surfels`; zeros where culled. All but its means carry
-             gradients: `means2d` does
-    """
-
-    def _field(self, first: int, width: int) -> torch.Tensor:
-        return self.records.view(self.cameras, self.gaussians, kernels.RECORD)[..., first : first + width]
+class SurfelProjection(Projected):
+    """Surfels projected. records: [M, 24], see `gdpro_sim.kernels.surfels`."""
 
     @property
     def depths(self) -> torch.Tensor:
@@ -45,7 +39,7 @@ def project_surfels(
     degree: int | None,
     view: View,
 ) -> SurfelProjection:
-    """Project N >= 1 surfels (means, quats, scales [N, >= 2], opacities) into C >= 1 cameras; sort by depth.
+    """Project N surfels (means, quats, scales [N, >= 2], opacities) into C cameras; sort by depth.
 
     The first three channels of the records are colours from `colors` [N, K, 3] of spherical harmonics where
     `degree` is given, else the first three of `colors` [N or C N, D], D >= 0.
@@ -75,8 +69,8 @@ class _Project(torch.autograd.Function):
         records = buffers.empty((total, kernels.RECORD), means.dtype, means.device)
         radii = buffers.empty((total, 2), torch.int32, means.device)
         rects = buffers.empty((total, 4), torch.int16, means.device)
-        keys = buffers.empty((cameras, 2 * count), torch.float32, means.device)
-        order = buffers.empty((cameras, 2 * count), torch.int32, means.device)
+        keys = torch.empty((cameras, 2 * count), device=means.device)
+        order = torch.empty((cameras, 2 * count), dtype=torch.int32, device=means.device)
         lanes = lanes_of(means)
         launch_chunked(
             kernels.project_surfels,
@@ -108,9 +102,9 @@ class _Project(torch.autograd.Function):
             device=device_name(means),
             minimum=256,
         )
-        for camera in range(cameras):
+        for camera in range(cameras if count > 0 else 0):
             sort_pairs(keys[camera], order[camera], count)
-        means2d = records.view(cameras, count, -1)[..., :2].contiguous()
+        means2d = records.view(cameras, count, kernels.RECORD)[..., :2].contiguous()
         ctx.save_for_backward(means, quats, scales, opacities, sh, features, viewmats, Ks, rects)
         ctx.degree = degree
         ctx.mark_non_differentiable(radii, rects, order)
@@ -118,6 +112,7 @@ class _Project(torch.autograd.Function):
         return records, means2d, radii, rects, order
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         g_records, g_means2d = gradients[:2]
         means, quats, scales, opacities, sh, features, viewmats, Ks, rects = ctx.saved_tensors
@@ -173,6 +168,9 @@ class _Project(torch.autograd.Function):
                 device=device_name(means),
                 minimum=4,
             )
+        if cameras == 0:
+            for gradient in (g_means, g_quats, g_scales, g_opacities, g_sh, g_features):
+                gradient.zero_()
         g_viewmats, g_Ks = camera_gradients(g_cameras) if with_cameras else (None, None)
         return g_means, g_quats, g_scales, g_opacities, g_sh, g_features, g_viewmats, g_Ks, None, None
 

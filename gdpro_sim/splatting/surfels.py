@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ import torch
 from gdpro_sim.device import beside_torch
 from gdpro_sim.splatting.batches import batched
 from gdpro_sim.splatting.checks import (
+    INDEX_LIMIT,
     check_choice,
     check_colors,
     check_count,
@@ -93,7 +95,7 @@ def rasterization_2dgs(
     Source: Huang et al., "2D Gaussian Splatting for Geometrically Accurate Radiance Fields" (2024), eq. 4-19.
     """
     options = RasterOptions() if options is None else options
-    check_gsplat_arguments(gsplat)
+    check_gsplat_arguments("rasterization_2dgs", gsplat)
     means = check_tensor("means", means, ("N", 3))
     count = len(means)
     quats = check_tensor("quats", quats, (count, 4), means)
@@ -130,6 +132,7 @@ def rasterization_2dgs(
 
     columns, rows = view.tiles
     channels = features + with_depth
+    check_count("Gaussians", count, INDEX_LIMIT // 2)
     check_count("Gaussians times cameras", cameras * count)
     check_count("image values (cameras x height x width x channels)", cameras * height * width * channels)
     check_count("image columns or rows", max(width, height), 16 * 32767)
@@ -216,19 +219,11 @@ def _project_and_bin(
     tile: bool,
 ) -> tuple[SurfelProjection, TileLists]:
     """The first two stages over checked arguments; `colors` [N, K, 3], or [N or C N, F] with F >= 0."""
-    means = surfels[0]
-    cameras, count = len(view.viewmats), len(means)
-    if cameras * count == 0:
-        nothing = SurfelProjection(
-            means.new_zeros((0, 24)),
-            means.new_zeros((cameras, count, 2)),
-            means.new_zeros((0, 2), dtype=torch.int32),
-            means.new_zeros((0, 4), dtype=torch.int16),
-            means.new_zeros((cameras, 0), dtype=torch.int32),
-        )
-        return nothing, empty_lists(cameras, view, means.device)
     projection = project_surfels(surfels, colors, degree, view)
-    return projection, (count_and_fill if tile else expand_and_sort)(projection, view, limit)
+    if len(projection.records) == 0:
+        return projection, empty_lists(projection.cameras, view, projection.records.device)
+    lists = (count_and_fill if tile else expand_and_sort)(projection, view, limit)
+    return replace(projection, order=None), lists
 
 
 __all__ = ["DEPTH_MODES", "rasterization_2dgs"]

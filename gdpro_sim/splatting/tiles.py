@@ -12,7 +12,7 @@ from gdpro_sim.kernels import tiles as kernels
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.checks import INDEX_LIMIT, check_count
-from gdpro_sim.splatting.projection import Projection, View, array, sort_pairs
+from gdpro_sim.splatting.projection import Projected, View, array, sort_pairs
 
 PART = 4096
 """Fewest Gaussians worth a part (and so a thread) of the counting sort."""
@@ -38,7 +38,13 @@ def empty_lists(cameras: int, view: View, device: torch.device) -> TileLists:
     )
 
 
-def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
+def _order(projection: Projected) -> torch.Tensor:
+    if projection.order is None:
+        raise ValueError("the depth order of this projection is gone: its tile lists are made already")
+    return projection.order
+
+
+def count_and_fill(projection: Projected, view: View, limit: int = INDEX_LIMIT) -> TileLists:
     """Counting sort, for CPUs; the lists do not depend on the number of threads.
 
     Raises RequestError where more than `limit` entries are needed.
@@ -47,7 +53,7 @@ def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT)
     tiles = projection.cameras * rows * columns
     parts = max(1, min(thread_count(), projection.gaussians // PART))
     rects = array(projection.rects, vec4s)
-    order = array(projection.order, wp.int32)
+    order = array(_order(projection), wp.int32)
     counts = torch.zeros((parts, tiles), dtype=torch.int32)
     offsets = torch.empty(tiles + 1, dtype=torch.int32)
     entries = torch.empty(1, dtype=torch.int64)
@@ -63,7 +69,7 @@ def count_and_fill(projection: Projection, view: View, limit: int = INDEX_LIMIT)
     return TileLists(offsets, ids)
 
 
-def expand_and_sort(projection: Projection, view: View, limit: int = INDEX_LIMIT) -> TileLists:
+def expand_and_sort(projection: Projected, view: View, limit: int = INDEX_LIMIT) -> TileLists:
     """The same lists from pairs in depth order and a stable radix sort by tile, for GPUs.
 
     Raises RequestError where more than `limit` entries are needed.
@@ -74,12 +80,12 @@ def expand_and_sort(projection: Projection, view: View, limit: int = INDEX_LIMIT
     device = projection.records.device
     name = device_name(projection.records)
     rects = array(projection.rects, vec4s)
-    order = array(projection.order, wp.int32)
+    order = array(_order(projection), wp.int32)
     counts = torch.empty(total, dtype=torch.int32, device=device)
     inputs = [order, rects, projection.gaussians]
     launch_chunked(kernels.count_expansion, total, inputs, [array(counts, wp.int32)], device=name)
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
-    entries = check_count("tile list entries", int(ends[-1]), limit)
+    entries = check_count("tile list entries", int(ends[-1]), min(limit, INDEX_LIMIT // 2))
     if entries == 0:
         return empty_lists(projection.cameras, view, device)
     begins = (ends - counts).to(torch.int32)

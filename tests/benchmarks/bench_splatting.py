@@ -39,8 +39,8 @@ PEER = {
     (50_000, 512): (313.0, 516.0),
     (200_000, 512): (466.0, 782.0),
 }
-"""OpenSplat's C++ CPU rasteriser, wall ms forward and forward + backward: published in SPLATTING.md, measured
-on another hour, two quiet cores. Of 10k @ 512 only its CPU time is there."""
+"""OpenSplat's C++ CPU rasteriser on the same scene, wall ms forward and forward + backward: measured once, on
+two quiet cores of another hour, and not again in this run. Of 10k @ 512 only its CPU time is known."""
 
 TABLES = ("times", "rates", "stages", "surfels")
 
@@ -174,7 +174,7 @@ def table(header: str) -> None:
 def print_times(repeats: int, cores: int) -> None:
     print("\n## Wall / CPU ms of an image\n")
     print(
-        "Peer: OpenSplat (C++ on the CPU), wall ms, published in SPLATTING.md, measured on another hour; "
+        "Peer: OpenSplat (C++ on the CPU), wall ms, a published figure measured on another hour; "
         "* its CPU time. Ratio: the peer's time over ours with all cores, forward and forward + backward."
     )
     counts = sorted({1, cores})

@@ -11,8 +11,8 @@ import warp as wp
 from gdpro_sim.cameras import Cameras
 from gdpro_sim.device import device_name, launch_chunked
 from gdpro_sim.gaussians import rgb_to_sh
-from gdpro_sim.kernels.compositing import ALPHA_MAX, LN2, TRANSMITTANCE_MIN, log2_alpha
-from gdpro_sim.kernels.projection import LOG2_CUTOFF, TILE
+from gdpro_sim.kernels.compositing import ALPHA_MAX, LN2, TRANSMITTANCE_MIN
+from gdpro_sim.kernels.projection import FACTOR, LOG2_CUTOFF, LOG2_OPACITY, MEAN, TILE
 from gdpro_sim.splatting.projection import array
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -42,6 +42,16 @@ def front_camera(size: int) -> Cameras:
     return Cameras.look_at(
         [[0.0, -3.2, 0.6]], [0.0, 0.0, 0.0], vertical_fov=2 * math.asin(1.05 / 3.25), width=size, height=size
     )
+
+
+@wp.func
+def log2_alpha(records: wp.array2d[float], i: int, px: float, py: float) -> float:
+    """Base-2 logarithm of a Gaussian's alpha at a pixel position, before the 0.99 limit."""
+    dx = px - records[i, MEAN]
+    dy = py - records[i, MEAN + 1]
+    u = records[i, FACTOR] * dx + records[i, FACTOR + 1] * dy
+    v = records[i, FACTOR + 2] * dy
+    return records[i, LOG2_OPACITY] - u * u - v * v
 
 
 @wp.kernel

@@ -46,5 +46,13 @@ def test_axes_that_do_not_fit() -> None:
     with pytest.raises(ValueError, match=r"opacities must begin with the batch axes of means, \[2, 3\], got"):
         rasterization(**both, width=25, height=20)
     both["means"] = torch.zeros(0, 30, 3)
-    with pytest.raises(ValueError, match="must begin with the batch axes of means"):
+    with pytest.raises(ValueError, match="means must hold at least one scene"):
         rasterization(**both, width=25, height=20)
+
+
+def test_batches_without_gaussians() -> None:
+    _, both, _ = stacked()
+    none = {n: v[:, :, :0] if n not in ("viewmats", "Ks", "backgrounds") else v for n, v in both.items()}
+    image, alpha, _ = rasterization(**none, width=25, height=20)
+    assert image.shape == (2, 3, 2, 20, 25, 3)
+    assert alpha.abs().max() == 0

@@ -68,10 +68,13 @@ def test_lists_hold_what_touches_each_tile_by_depth() -> None:
 def test_counting_sort_and_expansion_agree() -> None:
     scene, views = cloud(700, 2), cameras(3, 83, 47)
     _, _, meta = rasterization(**scene, colors=features(700, 3, 2), **views)
-    projection = meta["projection"]
-    from gdpro_sim.splatting.projection import View
+    with pytest.raises(ValueError, match="its tile lists are made already"):
+        count_and_fill(meta["projection"], meta["weigh"].args[3])
+    from gdpro_sim.splatting.projection import View, project
 
     view = View(views["viewmats"], views["Ks"], 83, 47, 0.01, 1e10, 0.0, 0.3, False)
+    gaussians = (scene["means"], scene["quats"], scene["scales"], scene["opacities"])
+    projection = project(gaussians, features(700, 3, 2), None, view)
     for threads in (1, 4):
         device.set_thread_count(threads)
         counted, expanded = count_and_fill(projection, view), expand_and_sort(projection, view)
