@@ -194,76 +194,87 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-        g_records, g_means2d = gradients[:2]
-        if g_records is None and g_means2d is None:
-            return (None,) * 10
-        with beside_torch(ctx.saved_tensors[0]):
-            return _project_backward(ctx, g_records, g_means2d)
+        view: View = ctx.view
+        kernel = projection_backward.project_backward
+        settings = [view.width, view.height, view.eps2d, view.antialiased]
+        return backward_of_projection(ctx, gradients, kernel, settings, int(kernels.RECORD), wp.vec3, 4)
 
 
-def _project_backward(
-    ctx: Any, g_records: torch.Tensor | None, g_means2d: torch.Tensor | None
+def backward_of_projection(
+    ctx: Any,
+    gradients: tuple[torch.Tensor | None, ...],
+    kernel: wp.Kernel,
+    settings: list[Any],
+    record: int,
+    scale_type: type,
+    channels: int,
 ) -> tuple[torch.Tensor | None, ...]:
+    """Gradients at what a projection was given, from those at its records [M, `record`] and means2d.
+
+    `kernel` takes `settings` after the intrinsics; records hold the first `channels` features. Fits a forward
+    whose first eight arguments and saved tensors are those of `_Project`, with two more without gradients.
+    """
+    g_records, g_means2d = gradients[:2]
+    if g_records is None and g_means2d is None:
+        return (None,) * 10
     means, quats, scales, opacities, sh, features, viewmats, Ks, rects = ctx.saved_tensors
-    view: View = ctx.view
     cameras, total = len(viewmats), len(rects)
-    if g_records is None:
-        g_records = means.new_zeros((total, int(kernels.RECORD)))
-    if g_means2d is None:
-        g_means2d = means.new_zeros((total, 2))
-    g_means, g_quats = buffers.empty_like(means), buffers.empty_like(quats)
-    g_scales, g_opacities = buffers.empty_like(scales), buffers.empty_like(opacities)
-    whole = ctx.degree is None or (ctx.degree + 1) ** 2 == sh.shape[1]
-    g_sh = buffers.empty_like(sh) if whole else buffers.empty_like(sh).zero_()
-    g_features = buffers.empty_like(features)
-    if features.shape[1] > 4:
-        g_features.zero_()
-    with_cameras = bool(ctx.needs_input_grad[6] or ctx.needs_input_grad[7])
-    lanes = lanes_of(means)
-    groups = -(-len(means) // lanes)
-    groups_per_run = 64 if lanes > 1 or with_cameras else 1
-    runs = -(-groups // groups_per_run)
-    g_cameras = means.new_zeros((runs if with_cameras else 0, cameras, projection_backward.CAMERA_GRADIENTS))
-    launch_chunked(
-        projection_backward.project_backward,
-        runs,
-        [
-            groups_per_run,
-            lanes,
-            array(means, wp.vec3),
-            array(quats, wp.vec4),
-            array(scales, wp.vec3),
-            array(opacities, wp.float32),
-            array(sh, wp.vec3),
-            -1 if ctx.degree is None else ctx.degree,
-            array(viewmats, wp.mat44),
-            array(Ks, wp.mat33),
-            view.width,
-            view.height,
-            view.eps2d,
-            view.antialiased,
-            with_cameras,
-            array(rects, vec4s),
-            array(g_records.contiguous(), wp.float32),
-            array(g_means2d.reshape(total, 2).contiguous(), wp.float32),
-        ],
-        [
-            array(g_means, wp.vec3),
-            array(g_quats, wp.vec4),
-            array(g_scales, wp.vec3),
-            array(g_opacities, wp.float32),
-            array(g_sh, wp.vec3),
-            array(g_features, wp.float32),
-            array(g_cameras, wp.float32),
-        ],
-        device=device_name(means),
-        minimum=4,
-    )
-    if cameras == 0:
-        for gradient in (g_means, g_quats, g_scales, g_opacities, g_sh, g_features):
-            gradient.zero_()
-    g_viewmats, g_Ks = camera_gradients(g_cameras) if with_cameras else (None, None)
-    return g_means, g_quats, g_scales, g_opacities, g_sh, g_features, g_viewmats, g_Ks, None, None
+    with beside_torch(means):
+        if g_records is None:
+            g_records = means.new_zeros((total, record))
+        if g_means2d is None:
+            g_means2d = means.new_zeros((total, 2))
+        g_means, g_quats = buffers.empty_like(means), buffers.empty_like(quats)
+        g_scales, g_opacities = buffers.empty_like(scales), buffers.empty_like(opacities)
+        whole = ctx.degree is None or (ctx.degree + 1) ** 2 == sh.shape[1]
+        g_sh = buffers.empty_like(sh) if whole else buffers.empty_like(sh).zero_()
+        g_features = buffers.empty_like(features)
+        if features.shape[1] > channels:
+            g_features.zero_()
+        with_cameras = bool(ctx.needs_input_grad[6] or ctx.needs_input_grad[7])
+        lanes = lanes_of(means)
+        groups = -(-len(means) // lanes)
+        groups_per_run = 64 if lanes > 1 or with_cameras else 1
+        runs = -(-groups // groups_per_run)
+        count = projection_backward.CAMERA_GRADIENTS
+        g_cameras = means.new_zeros((runs if with_cameras else 0, cameras, count))
+        launch_chunked(
+            kernel,
+            runs,
+            [
+                groups_per_run,
+                lanes,
+                array(means, wp.vec3),
+                array(quats, wp.vec4),
+                array(scales, scale_type),
+                array(opacities, wp.float32),
+                array(sh, wp.vec3),
+                -1 if ctx.degree is None else ctx.degree,
+                array(viewmats, wp.mat44),
+                array(Ks, wp.mat33),
+                *settings,
+                with_cameras,
+                array(rects, vec4s),
+                array(g_records.contiguous(), wp.float32),
+                array(g_means2d.reshape(total, 2).contiguous(), wp.float32),
+            ],
+            [
+                array(g_means, wp.vec3),
+                array(g_quats, wp.vec4),
+                array(g_scales, scale_type),
+                array(g_opacities, wp.float32),
+                array(g_sh, wp.vec3),
+                array(g_features, wp.float32),
+                array(g_cameras, wp.float32),
+            ],
+            device=device_name(means),
+            minimum=4,
+        )
+        if cameras == 0:
+            for gradient in (g_means, g_quats, g_scales, g_opacities, g_sh, g_features):
+                gradient.zero_()
+        g_viewmats, g_Ks = camera_gradients(g_cameras) if with_cameras else (None, None)
+        return g_means, g_quats, g_scales, g_opacities, g_sh, g_features, g_viewmats, g_Ks, None, None
 
 
 def camera_gradients(sums: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -284,7 +295,7 @@ __all__ = [
     "Projection",
     "View",
     "array",
-    "camera_gradients",
+    "backward_of_projection",
     "lanes_of",
     "project",
     "sort_pairs",

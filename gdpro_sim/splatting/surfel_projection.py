@@ -9,13 +9,19 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from gdpro_sim.device import beside_torch, device_name, launch_chunked
+from gdpro_sim.device import device_name, launch_chunked
 from gdpro_sim.kernels import surfels as kernels
 from gdpro_sim.kernels import surfels_backward
 from gdpro_sim.kernels.projection import vec4s
-from gdpro_sim.kernels.projection_backward import CAMERA_GRADIENTS
 from gdpro_sim.splatting import buffers
-from gdpro_sim.splatting.projection import Projected, View, array, camera_gradients, lanes_of, sort_pairs
+from gdpro_sim.splatting.projection import (
+    Projected,
+    View,
+    array,
+    backward_of_projection,
+    lanes_of,
+    sort_pairs,
+)
 
 
 @dataclass(frozen=True)
@@ -114,65 +120,8 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-        g_records, g_means2d = gradients[:2]
-        means, quats, scales, opacities, sh, features, viewmats, Ks, rects = ctx.saved_tensors
-        if g_records is None and g_means2d is None:
-            return (None,) * 10
-        cameras, total = len(viewmats), len(rects)
-        if g_records is None:
-            g_records = means.new_zeros((total, kernels.RECORD))
-        if g_means2d is None:
-            g_means2d = means.new_zeros((total, 2))
-        g_means, g_quats = buffers.empty_like(means), buffers.empty_like(quats)
-        g_scales, g_opacities = buffers.empty_like(scales), buffers.empty_like(opacities)
-        whole = ctx.degree is None or (ctx.degree + 1) ** 2 == sh.shape[1]
-        g_sh = buffers.empty_like(sh) if whole else buffers.empty_like(sh).zero_()
-        g_features = buffers.empty_like(features)
-        if features.shape[1] > 3:
-            g_features.zero_()
-        with_cameras = bool(ctx.needs_input_grad[6] or ctx.needs_input_grad[7])
-        lanes = lanes_of(means)
-        groups = -(-len(means) // lanes)
-        groups_per_run = 64 if lanes > 1 or with_cameras else 1
-        runs = -(-groups // groups_per_run)
-        g_cameras = means.new_zeros((runs if with_cameras else 0, cameras, CAMERA_GRADIENTS))
-        with beside_torch(means):
-            launch_chunked(
-                surfels_backward.project_surfels_backward,
-                runs,
-                [
-                    groups_per_run,
-                    lanes,
-                    array(means, wp.vec3),
-                    array(quats, wp.vec4),
-                    array(scales, wp.float32),
-                    array(opacities, wp.float32),
-                    array(sh, wp.vec3),
-                    -1 if ctx.degree is None else ctx.degree,
-                    array(viewmats, wp.mat44),
-                    array(Ks, wp.mat33),
-                    with_cameras,
-                    array(rects, vec4s),
-                    array(g_records.contiguous(), wp.float32),
-                    array(g_means2d.reshape(total, 2).contiguous(), wp.float32),
-                ],
-                [
-                    array(g_means, wp.vec3),
-                    array(g_quats, wp.vec4),
-                    array(g_scales, wp.float32),
-                    array(g_opacities, wp.float32),
-                    array(g_sh, wp.vec3),
-                    array(g_features, wp.float32),
-                    array(g_cameras, wp.float32),
-                ],
-                device=device_name(means),
-                minimum=4,
-            )
-        if cameras == 0:
-            for gradient in (g_means, g_quats, g_scales, g_opacities, g_sh, g_features):
-                gradient.zero_()
-        g_viewmats, g_Ks = camera_gradients(g_cameras) if with_cameras else (None, None)
-        return g_means, g_quats, g_scales, g_opacities, g_sh, g_features, g_viewmats, g_Ks, None, None
+        kernel = surfels_backward.project_surfels_backward
+        return backward_of_projection(ctx, gradients, kernel, [], kernels.RECORD, wp.float32, 3)
 
 
 __all__ = ["SurfelProjection", "project_surfels"]
