@@ -24,6 +24,7 @@ from torch import Tensor
 from gdpro_sim import Cameras, Gaussians, RasterOptions
 from gdpro_sim.binding import face_normals, vertex_normals
 from gdpro_sim.device import serial_torch
+from gdpro_sim.errors import GdproError
 from gdpro_sim.files import prepare_folder
 from gdpro_sim.gaussians import rgb_to_sh
 from gdpro_sim.io.images import write_png
@@ -232,6 +233,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--out", default="out/fit_views")
     options = parser.parse_args()
+    for name in ("gaussians", "size", "seconds", "iterations"):
+        if not getattr(options, name) > 0:
+            parser.error(f"--{name} must be above 0, got {getattr(options, name)}")
     with serial_torch():
         fit(options)
 
@@ -276,4 +280,7 @@ def fit(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (GdproError, OSError) as error:
+        raise SystemExit(f"fit_views: {error}") from None
