@@ -30,6 +30,10 @@ class SceneError(RequestError):
     """A scene description is wrong."""
 
 
+class GuidanceError(RequestError):
+    """A prompt, a prior, pictures or a diffusion model cannot guide a generation."""
+
+
 class DeviceError(RequestError):
     """The requested compute device does not exist here."""
 
@@ -46,6 +50,7 @@ __all__ = [
     "AssetError",
     "DeviceError",
     "GdproError",
+    "GuidanceError",
     "MeshError",
     "OutputError",
     "RequestError",

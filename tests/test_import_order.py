@@ -16,7 +16,7 @@ FLOORS: list[set[str]] = [
     {"gaussians", "cameras", "binding", "materials"},
     {"splatting"},
     {"meshing", "asset"},
-    {"simulation"},
+    {"generation", "simulation"},
     {"io"},
     {"cli"},
 ]

@@ -1,0 +1,265 @@
+"""Every number of generation in one place: `default` is sized for a CPU, `paper` is the paper's.
+
+Sources: *paper* GaussianDreamerPro (arXiv 2406.18462); *code* its released code, LucidDreamer (arXiv
+2311.11284), SuGaR and 2DGS; *ours* chosen here. Lengths are in the unit frame (bounding sphere of radius 1).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class ScoreConfig(_Part):
+    """Score distillation: ISM, or SDS to compare with."""
+
+    method: Literal["ism", "sds"] = Field(default="ism", description="ism (paper) or sds (DreamFusion)")
+    guidance_scale: float = Field(default=7.5, ge=0.0, description="classifier-free guidance (paper: 7.5)")
+    gradient_scale: float = Field(default=0.1, gt=0.0, description="factor on the gradient (code: 0.1)")
+    warmup: int = Field(
+        default=1000, ge=0, description="iterations over which omega falls from 1 to 0 (code: 1000)"
+    )
+    t_min: int = Field(default=20, ge=1, le=999, description="smallest diffusion step (code: 20)")
+    t_max: int = Field(
+        default=500, ge=2, le=1000, description="largest step once warmed up, excluded (code: 500)"
+    )
+    t_warmup: int = Field(default=480, ge=0, le=980, description="added to t_max at the start (code: 480)")
+    interval: int = Field(default=80, ge=1, description="s = t - interval once warmed up (code: 80)")
+    interval_warmup: int = Field(
+        default=20, ge=0, description="added to the interval at the start (code: 20)"
+    )
+    inversion_stride: int = Field(
+        default=200, ge=1, description="stride of the DDIM inversion, steps (code: 200)"
+    )
+    shared_noise: float = Field(
+        default=0.1, ge=0.0, description="weight of noise shared by a channel (code: 0.1)"
+    )
+    flip_probability: float = Field(
+        default=0.5,
+        ge=0.0,
+        le=1.0,
+        description="mirror the batch; camera-conditioned guidance never (code: 0.5)",
+    )
+    depth_probability: float = Field(
+        default=0.2,
+        ge=0.0,
+        le=1.0,
+        description="share of iterations that show disparity as an image (code: 0.2)",
+    )
+    nan_limit: int = Field(
+        default=20, ge=0, description="iterations with NaN from the model before the run stops (ours)"
+    )
+
+
+class GuidanceConfig(_Part):
+    kind: Literal["procedural", "views", "diffusers"] = Field(
+        default="procedural", description="who judges the pictures"
+    )
+    model: str | None = Field(default=None, description="diffusers: local directory, or a hub id")
+    negative_prompt: str = Field(
+        default="unrealistic, blurry, low quality, out of focus, ugly, low contrast, dull, low-resolution, "
+        "oversaturation",
+        description="diffusers: negative prompt (code)",
+    )
+    view_prompts: bool = Field(
+        default=True, description="diffusers: append front, side and back view (paper)"
+    )
+    perp_neg: bool = Field(
+        default=False, description="diffusers: Perp-Neg (arXiv 2304.04968), off by default (code)"
+    )
+    space: Literal["auto", "latent", "pixel"] = Field(default="auto", description="diffusers: what is noised")
+    dtype: Literal["auto", "float32", "float16", "bfloat16"] = Field(
+        default="auto", description="auto: half on CUDA"
+    )
+    cpu_offload: bool = Field(
+        default=False, description="diffusers: move parts to the GPU one by one (accelerate)"
+    )
+    instances: int = Field(
+        default=1, ge=1, le=16, description="procedural: seeded variants K in the posterior mean"
+    )
+    kernel_width: float = Field(
+        default=0.0, ge=0.0, description="closed form: width h of each variant, in colour units"
+    )
+    jitter: float = Field(
+        default=0.0, ge=0.0, description="closed form: random shift of the target per step (ablation)"
+    )
+    resolution: int = Field(
+        default=192, ge=64, le=512, description="procedural: cells across the reference surface"
+    )
+
+
+class PriorConfig(_Part):
+    kind: Literal["procedural", "mesh", "shap-e", "hull", "sphere"] = Field(
+        default="procedural", description="where the coarse mesh comes from; hull: from photos with alpha"
+    )
+    file: str | None = Field(default=None, description="mesh: its file")
+    model: str | None = Field(default=None, description="shap-e: local directory, or a hub id")
+    cap3d: str | None = Field(
+        default=None, description="shap-e: Cap3D's fine-tuned prior weights, a .pth file (paper)"
+    )
+    prompt: str | None = Field(
+        default=None, description="prompt of the prior where it differs from the main one (code)"
+    )
+    resolution: int = Field(
+        default=28, ge=8, le=256, description="cells across the coarse surface (ours: coarse on purpose)"
+    )
+    guidance_scale: float = Field(default=15.0, ge=0.0, description="shap-e (paper: 15)")
+    steps: int = Field(default=64, ge=1, description="shap-e: Karras steps (paper: 64)")
+
+
+class CameraConfig(_Part):
+    """Random training cameras; pairs are ranges at the first iteration and once tightened."""
+
+    radius: tuple[float, float] = Field(default=(5.2, 5.5), description="distance at the start (code)")
+    radius_late: tuple[float, float] = Field(
+        default=(4.6, 5.2), description="distance at the end (code: 3.5 to 5.0)"
+    )
+    fov: tuple[float, float] = Field(
+        default=(0.44, 0.60), description="vertical, rad, at the start (code: 0.32 to 0.60)"
+    )
+    fov_late: tuple[float, float] = Field(
+        default=(0.34, 0.50), description="vertical, rad, at the end (code: 0.16 to 0.60)"
+    )
+    polar: tuple[float, float] = Field(default=(30.0, 150.0), description="degrees from +Z (paper)")
+    jitter_centre: float = Field(default=0.03, ge=0.0, description="standard deviation of the eye (code)")
+    jitter_target: float = Field(
+        default=0.03, ge=0.0, description="standard deviation of the point looked at (code)"
+    )
+    jitter_up: float = Field(default=0.02, ge=0.0, description="standard deviation of the up vector (code)")
+    tighten: float = Field(
+        default=0.5, ge=0.0, le=1.0, description="share of the run over which the ranges move (ours)"
+    )
+
+
+class SurfelConfig(_Part):
+    """Stage 1."""
+
+    kind: Literal["surfels", "gaussians"] = Field(
+        default="surfels", description="2D surfels (paper) or 3D Gaussians"
+    )
+    iterations: int = Field(default=350, ge=0, description="(paper: 5000)")
+    batch: int = Field(default=2, ge=1, description="views an iteration (paper: 4)")
+    resolution: int = Field(default=128, ge=16, description="pixels across a rendered view (paper: 1024)")
+    supersample: int = Field(
+        default=1, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
+    )
+    initial: int = Field(
+        default=6000, ge=16, description="surfels at the start (paper: the prior's vertices)"
+    )
+    maximum: int = Field(default=16000, ge=16, description="hard cap on the count (ours)")
+    initial_opacity: float = Field(default=0.1, gt=0.0, lt=1.0, description="(code: 0.1)")
+    lr_position: float = Field(default=1e-3, gt=0.0, description="Adam, first step (paper: 1.6e-5 x extent)")
+    lr_position_final: float = Field(default=1e-4, gt=0.0, description="Adam, last step (log decay)")
+    lr_color: float = Field(default=2e-2, gt=0.0, description="(paper: 5e-3)")
+    lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
+    lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2)")
+    lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    sh_degree: int = Field(default=0, ge=0, le=3, description="highest SH degree (paper: 3)")
+    sh_every: int = Field(default=500, ge=1, description="iterations between degrees (code: 500)")
+    tv: float = Field(
+        default=10.0, ge=0.0, description="weight of total variation of colour and depth (paper: 10)"
+    )
+    normal_consistency: float = Field(
+        default=0.1, ge=0.0, description="weight, from the end of densification on (code)"
+    )
+    distortion: float = Field(
+        default=0.0, ge=0.0, description="weight of depth distortion (2DGS: 100 to 1000; code: 0)"
+    )
+    densify_from: int = Field(default=40, ge=0, description="first iteration (code: 100)")
+    densify_until: int = Field(default=230, ge=0, description="last iteration (code: 2500)")
+    densify_every: int = Field(default=30, ge=1, description="(code: 100)")
+    densify_gradient: float = Field(
+        default=2e-4, gt=0.0, description="view-space position gradient, NDC (code: 2e-4)"
+    )
+    split_factor: float = Field(
+        default=1.6, gt=1.0, description="a split one's scale is divided by this (code: 1.6)"
+    )
+    split_size: float = Field(
+        default=0.01, gt=0.0, description="larger ones are split, smaller cloned, x extent (code)"
+    )
+    prune_opacity: float = Field(default=0.005, ge=0.0, lt=1.0, description="(code: 0.005)")
+    reset_every: int = Field(default=0, ge=0, description="opacity reset, 0: never (code: 400)")
+
+
+class ExtractionConfig(_Part):
+    points: Literal["rendered-depth", "level-set", "centres"] = Field(
+        default="rendered-depth", description="what Poisson is given; centres: the paper's own"
+    )
+    cameras: int = Field(default=24, ge=6, description="views the points are cast from (code: 15)")
+    resolution: int = Field(default=256, ge=32, description="pixels across such a view (ours)")
+    level: float = Field(default=0.3, gt=0.0, description="density of the level set (code: 0.3)")
+    depth: int = Field(default=7, ge=4, le=11, description="octree depth of screened Poisson (code: 10)")
+    trim: float = Field(
+        default=0.05,
+        ge=0.0,
+        lt=1.0,
+        description="least support, as a quantile of the density; watertight off",
+    )
+    watertight: bool = Field(default=True, description="closed, as physics needs it (ours)")
+    keep: Literal["largest", "all"] = Field(default="largest", description="components kept (paper: largest)")
+    triangles: int = Field(default=6000, ge=20, description="target count of stage 2's mesh (code: 40000)")
+
+
+class RefinementConfig(_Part):
+    """Stage 2."""
+
+    mode: Literal["bound", "frozen", "unbound", "textured-mesh"] = Field(
+        default="bound", description="bound; others ablate"
+    )
+    iterations: int = Field(default=350, ge=0, description="(paper: 5000)")
+    batch: int = Field(default=2, ge=1, description="views an iteration (paper: 4)")
+    resolution: int = Field(default=192, ge=16, description="pixels across a rendered view (paper: 1024)")
+    supersample: int = Field(
+        default=1, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
+    )
+    per_triangle: int = Field(
+        default=6, ge=1, description="Gaussians on a triangle: 1, 3, 4, 6, 10, ... (code: 55)"
+    )
+    initial_opacity: float = Field(default=0.7, gt=0.0, lt=1.0, description="(paper: 0.7)")
+    sh_degree: int = Field(default=0, ge=0, le=3, description="(paper: 0; code: 3)")
+    lr_vertex: float = Field(default=5e-4, gt=0.0, description="Adam, first step (paper: 1.6e-4 x extent)")
+    lr_vertex_final: float = Field(default=5e-5, gt=0.0, description="Adam, last step (log decay)")
+    lr_color: float = Field(default=2e-2, gt=0.0, description="(paper: 5e-3)")
+    lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
+    lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2; code: 5e-3)")
+    lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    tv: float = Field(default=1.0, ge=0.0, description="weight of total variation of colour (paper: 10)")
+    scale: float = Field(default=0.1, ge=0.0, description="weight of the mean scale (paper)")
+    normal_consistency: float = Field(
+        default=0.3, ge=0.0, description="weight over adjacent faces (code: 0.3)"
+    )
+    laplacian: float = Field(
+        default=0.0, ge=0.0, description="weight of the uniform Laplacian (available in code)"
+    )
+
+
+class OutputConfig(_Part):
+    turntable_views: int = Field(
+        default=6, ge=0, le=120, description="pictures a stage's turntable sheet has"
+    )
+    picture_size: int = Field(default=256, ge=32, le=2048, description="pixels across each of them")
+    checkpoint_every: int = Field(default=50, ge=1, description="iterations between checkpoints")
+    tets: bool = Field(default=True, description="fill the asset with tetrahedra")
+    target_tets: int = Field(default=6000, ge=50, description="about how many")
+    material: str | None = Field(default=None, description="physical preset; none: what the prior proposes")
+    height: float | None = Field(
+        default=None, gt=0.0, description="m; none: the prior's size, 0.3 where it knows none"
+    )
+
+
+class GenerationConfig(_Part):
+    score: ScoreConfig = ScoreConfig()
+    guidance: GuidanceConfig = GuidanceConfig()
+    prior: PriorConfig = PriorConfig()
+    cameras: CameraConfig = CameraConfig()
+    surfels: SurfelConfig = SurfelConfig()
+    extraction: ExtractionConfig = ExtractionConfig()
+    refinement: RefinementConfig = RefinementConfig()
+    output: OutputConfig = OutputConfig()

@@ -1,0 +1,1 @@
+"""Who judges the pictures: diffusion models, and closed-form scores of known pictures."""

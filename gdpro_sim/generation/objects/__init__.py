@@ -1,0 +1,1 @@
+"""Parametric objects and the vocabulary that names them."""

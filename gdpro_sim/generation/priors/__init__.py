@@ -1,0 +1,1 @@
+"""Where the coarse mesh comes from."""
