@@ -6,9 +6,15 @@ Sources: *paper* GaussianDreamerPro (arXiv 2406.18462); *code* its released code
 
 from __future__ import annotations
 
-from typing import Literal
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gdpro_sim.errors import RequestError
 
 
 class _Part(BaseModel):
@@ -246,7 +252,10 @@ class OutputConfig(_Part):
     )
     picture_size: int = Field(default=256, ge=32, le=2048, description="pixels across each of them")
     checkpoint_every: int = Field(default=50, ge=1, description="iterations between checkpoints")
-    tets: bool = Field(default=True, description="fill the asset with tetrahedra")
+    tets: bool = Field(
+        default=False,
+        description="fill the asset with tetrahedra now; they do not repeat to the bit (else: when simulated)",
+    )
     target_tets: int = Field(default=6000, ge=50, description="about how many")
     material: str | None = Field(default=None, description="physical preset; none: what the prior proposes")
     height: float | None = Field(
@@ -263,3 +272,167 @@ class GenerationConfig(_Part):
     extraction: ExtractionConfig = ExtractionConfig()
     refinement: RefinementConfig = RefinementConfig()
     output: OutputConfig = OutputConfig()
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "draft": {
+        "guidance": {"resolution": 128},
+        "surfels": {
+            "iterations": 120,
+            "initial": 4000,
+            "maximum": 8000,
+            "resolution": 96,
+            "densify_until": 90,
+        },
+        "extraction": {"resolution": 192, "triangles": 3000},
+        "refinement": {"iterations": 120, "resolution": 128},
+    },
+    "default": {},
+    "high": {
+        "guidance": {"resolution": 288},
+        "surfels": {
+            "iterations": 900,
+            "initial": 12000,
+            "maximum": 40000,
+            "resolution": 192,
+            "densify_until": 600,
+        },
+        "extraction": {"cameras": 32, "resolution": 384, "depth": 8, "triangles": 16000},
+        "refinement": {"iterations": 900, "resolution": 320},
+    },
+    "paper": {
+        "cameras": {"radius_late": (3.5, 5.0), "fov": (0.32, 0.60), "fov_late": (0.16, 0.60)},
+        "surfels": {
+            "iterations": 5000,
+            "batch": 4,
+            "resolution": 1024,
+            "supersample": 2,
+            "initial": 100_000,
+            "maximum": 1_000_000,
+            "lr_position": 1.6e-5,
+            "lr_position_final": 1.6e-7,
+            "lr_color": 5e-3,
+            "lr_sh": 2.5e-4,
+            "lr_scale": 5e-4,
+            "lr_rotation": 5e-4,
+            "sh_degree": 3,
+            "densify_from": 100,
+            "densify_until": 2500,
+            "densify_every": 100,
+            "reset_every": 400,
+        },
+        "extraction": {
+            "points": "level-set",
+            "cameras": 15,
+            "resolution": 512,
+            "depth": 10,
+            "triangles": 40_000,
+        },
+        "refinement": {
+            "iterations": 5000,
+            "batch": 4,
+            "resolution": 1024,
+            "supersample": 2,
+            "per_triangle": 55,
+            "lr_vertex": 1.6e-4,
+            "lr_vertex_final": 1.6e-6,
+            "lr_color": 5e-3,
+            "lr_sh": 2.5e-4,
+            "lr_scale": 5e-4,
+            "lr_rotation": 5e-4,
+            "tv": 10.0,
+            "scale": 1.0,
+        },
+        "prior": {"resolution": 64},
+        "guidance": {"resolution": 384},
+    },
+}
+"""What differs from the defaults. `paper` asks for a GPU; the others are sized for two CPU cores."""
+
+
+def load_config(
+    preset: str = "default",
+    file: str | Path | None = None,
+    overrides: Iterable[str] = (),
+    base: Mapping[str, Any] | None = None,
+) -> GenerationConfig:
+    """A configuration from a preset, a YAML file over it, `base` over that, and "part.field=value" last.
+
+    Raises RequestError naming the field, the value and what it must be.
+    """
+    if preset not in PRESETS:
+        raise RequestError(f"quality must be one of {', '.join(PRESETS)}, got {preset!r}")
+    values: dict[str, Any] = {part: dict(fields) for part, fields in PRESETS[preset].items()}
+    if file is not None:
+        _merge(values, _read(Path(file)), str(file))
+    _merge(values, base or {}, "options")
+    for item in overrides:
+        key, equals, text = item.partition("=")
+        part, dot, name = key.strip().partition(".")
+        if not (equals and dot and part and name):
+            raise RequestError(f"--set {item}: give PART.FIELD=VALUE, for instance surfels.iterations=500")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise RequestError(f"--set {item}: {text!r} is no YAML value") from None
+        _merge(values, {part: {name: value}}, f"--set {item}")
+    try:
+        return GenerationConfig.model_validate(values)
+    except ValidationError as error:
+        raise RequestError(_reason(error)) from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise RequestError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    except yaml.YAMLError as error:
+        raise RequestError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise RequestError(
+            f"{path}: must hold parts with fields, for instance `surfels: {{iterations: 500}}`"
+        )
+    return data
+
+
+def _merge(values: dict[str, Any], more: Mapping[str, Any], where: str) -> None:
+    known = GenerationConfig.model_fields
+    for part, fields in more.items():
+        if part not in known:
+            raise RequestError(f"{where}: no part {part!r}{_near(part, known)}; parts: {', '.join(known)}")
+        if not isinstance(fields, Mapping):
+            raise RequestError(f"{where}: {part} must hold fields, got {fields!r}")
+        names = getattr(known[part].annotation, "model_fields", {})
+        for name in fields:
+            if name not in names:
+                raise RequestError(f"{where}: {part} has no field {name!r}{_near(str(name), names)}")
+        values.setdefault(part, {}).update(fields)
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _reason(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(x) for x in first["loc"])
+    return f"{where}: {first['msg']}, got {first.get('input')!r}"
+
+
+__all__ = [
+    "PRESETS",
+    "CameraConfig",
+    "ExtractionConfig",
+    "GenerationConfig",
+    "GuidanceConfig",
+    "OutputConfig",
+    "PriorConfig",
+    "RefinementConfig",
+    "ScoreConfig",
+    "SurfelConfig",
+    "load_config",
+]
