@@ -1,7 +1,7 @@
 """Assets: bound Gaussians with everything simulation needs, in one USD file."""
 
 from gdpro_sim.asset.asset import Asset
-from gdpro_sim.asset.importer import import_mesh, tetrahedralize_asset
+from gdpro_sim.asset.importer import import_mesh, tetrahedralize_asset, versions
 from gdpro_sim.asset.stage import is_asset, kind
 
-__all__ = ["Asset", "import_mesh", "is_asset", "kind", "tetrahedralize_asset"]
+__all__ = ["Asset", "import_mesh", "is_asset", "kind", "tetrahedralize_asset", "versions"]

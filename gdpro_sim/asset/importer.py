@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
@@ -146,10 +146,10 @@ def tetrahedralize_asset(
     return replace(asset, tets=tets, embedding=embedding, provenance={**asset.provenance, "tets": made})
 
 
-def versions() -> dict[str, str]:
-    """Versions of this package and of those that shape an import."""
+def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str]:
+    """Versions of `packages`, by default this one and those that shape an import; "unknown" if absent."""
     found = {}
-    for package in _PACKAGES:
+    for package in packages:
         try:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
