@@ -11,15 +11,17 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.errors import AssetError
 from gdpro_sim.gaussians import SH_C0, Gaussians
-from gdpro_sim.kernels.binding import follow_triangles
+from gdpro_sim.kernels.binding import bind_triangles_backward, follow_triangles, gather_corners
 
 
 @dataclass(frozen=True)
@@ -117,18 +119,134 @@ class BoundGaussians:
         return Gaussians(means, quats, scales, torch.sigmoid(self.opacity_logits.detach()), sh.detach())
 
     def normals(self, vertices: torch.Tensor | None = None) -> torch.Tensor:
-        """Unit normals at each Gaussian, [N, 3]: vertex normals interpolated, face normals along sharp edges.
-
-        A corner whose vertex normal leaves the face's by 45 degrees or more counts as sharp, by less than 25
-        as smooth; in between the two are mixed, so that nothing jumps while a body deforms.
-        """
+        """Unit normals at each Gaussian, [N, 3]; see `surface_normals`."""
         v = self.vertices if vertices is None else vertices.to(self.device)
-        per_vertex, per_face = vertex_normals(v, self.faces), face_normals(v, self.faces)
-        corners = per_vertex[self.faces.long()]
-        cosine = (corners * per_face[:, None]).sum(2, keepdim=True)
-        smooth = ((cosine - 0.7072) / 0.2).clamp(0.0, 1.0)
-        corners = (per_face[:, None] + smooth * (corners - per_face[:, None]))[self.face_ids.long()]
-        return torch.nn.functional.normalize((corners * self.barycentrics[:, :, None]).sum(1), dim=1)
+        return surface_normals(v, self.faces, self.face_ids, self.barycentrics)
+
+
+class TriangleBinding:
+    """Where Gaussians ride on triangles, for learning: a differentiable map from vertices to Gaussians.
+
+    faces [F, 3] int32, face_ids [N] int32 in [0, F), barycentrics [N, 3] float32, as in `BoundGaussians`; all
+    on one device. `vertex_count` is V.
+    """
+
+    def __init__(
+        self, faces: torch.Tensor, face_ids: torch.Tensor, barycentrics: torch.Tensor, vertex_count: int
+    ) -> None:
+        self.faces, self.face_ids = faces.contiguous(), face_ids.contiguous()
+        self.barycentrics = barycentrics.contiguous()
+        self.vertex_count = vertex_count
+        self.order, self.offsets = _groups(self.face_ids, len(faces))
+        self.corners, self.corner_offsets = _groups(self.faces.view(-1), vertex_count)
+
+    def __call__(
+        self, vertices: torch.Tensor, rotations: torch.Tensor, log_scales: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Means [N, 3], unit quaternions [N, 4] and scales [N, 3] of Gaussians on `vertices` [V, 3] m.
+
+        rotations [N, 2] and log_scales [N, 3] as in `BoundGaussians`, whose `gaussians()` gives the same
+        bits. Gradients reach all three; through the frame of a triangle without area none does.
+        """
+        return _Bind.apply(vertices.contiguous(), rotations.contiguous(), log_scales.contiguous(), self)
+
+
+class _Bind(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        vertices: torch.Tensor,
+        rotations: torch.Tensor,
+        log_scales: torch.Tensor,
+        binding: TriangleBinding,
+    ) -> tuple[torch.Tensor, ...]:
+        n = len(binding.face_ids)
+        bound = BoundGaussians(
+            vertices,
+            binding.faces,
+            binding.face_ids,
+            binding.barycentrics,
+            rotations,
+            log_scales,
+            opacity_logits=vertices.new_zeros(n),
+            sh=vertices.new_zeros((n, 1, 3)),
+        )
+        at = bound.gaussians()
+        ctx.save_for_backward(vertices, rotations, at.quats, at.scales)
+        ctx.binding = binding
+        return at.means, at.quats, at.scales
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        vertices, rotations, quats, scales = (t.detach() for t in ctx.saved_tensors)
+        binding: TriangleBinding = ctx.binding
+        faces, device = binding.faces, device_name(vertices)
+        g_corners = vertices.new_empty((len(faces), 3, 3))
+        g_vertices = torch.empty_like(vertices)
+        # A Gaussian's gradients are written with its face's; every Gaussian has a face.
+        g_rotations, g_log_scales = torch.empty_like(rotations), torch.empty_like(scales)
+        g_means, g_quats, g_scales = (g.contiguous() for g in gradients)
+        with beside_torch(vertices):
+            launch_chunked(
+                bind_triangles_backward,
+                len(faces),
+                [
+                    wp.from_torch(vertices, dtype=wp.vec3),
+                    wp.from_torch(faces),
+                    wp.from_torch(binding.offsets),
+                    wp.from_torch(binding.order),
+                    wp.from_torch(binding.barycentrics, dtype=wp.vec3),
+                    wp.from_torch(rotations, dtype=wp.vec2),
+                    wp.from_torch(quats, dtype=wp.vec4),
+                    wp.from_torch(scales, dtype=wp.vec3),
+                    wp.from_torch(g_means, dtype=wp.vec3),
+                    wp.from_torch(g_quats, dtype=wp.vec4),
+                    wp.from_torch(g_scales, dtype=wp.vec3),
+                ],
+                [
+                    wp.from_torch(g_corners, dtype=wp.vec3),
+                    wp.from_torch(g_rotations, dtype=wp.vec2),
+                    wp.from_torch(g_log_scales, dtype=wp.vec3),
+                ],
+                device=device,
+                minimum=512,
+            )
+            launch_chunked(
+                gather_corners,
+                len(vertices),
+                [
+                    wp.from_torch(binding.corner_offsets),
+                    wp.from_torch(binding.corners),
+                    wp.from_torch(g_corners.view(-1, 3), dtype=wp.vec3),
+                ],
+                [wp.from_torch(g_vertices, dtype=wp.vec3)],
+                device=device,
+            )
+        return g_vertices, g_rotations, g_log_scales, None
+
+
+def _groups(owners: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Indices sorted by owner [M] int32 and where each owner's begin [count + 1] int32."""
+    order = torch.argsort(owners, stable=True).int()
+    sizes = torch.bincount(owners.long(), minlength=count)
+    return order, torch.nn.functional.pad(sizes.cumsum(0), (1, 0)).int()
+
+
+def surface_normals(
+    vertices: torch.Tensor, faces: torch.Tensor, face_ids: torch.Tensor, barycentrics: torch.Tensor
+) -> torch.Tensor:
+    """Unit normals [N, 3] at points of a mesh: vertex normals interpolated, face normals along sharp edges.
+
+    A corner whose vertex normal leaves the face's by 45 degrees or more counts as sharp, by less than 25 as
+    smooth; in between the two are mixed, so that nothing jumps while a body deforms.
+    """
+    per_vertex, per_face = vertex_normals(vertices, faces), face_normals(vertices, faces)
+    corners = per_vertex[faces.long()]
+    cosine = (corners * per_face[:, None]).sum(2, keepdim=True)
+    smooth = ((cosine - 0.7072) / 0.2).clamp(0.0, 1.0)
+    corners = (per_face[:, None] + smooth * (corners - per_face[:, None]))[face_ids.long()]
+    return torch.nn.functional.normalize((corners * barycentrics[:, :, None]).sum(1), dim=1)
 
 
 def face_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
@@ -206,4 +324,11 @@ def sh_basis(degree: int, directions: np.ndarray) -> np.ndarray:
     return np.stack([values for band in bands[: degree + 1] for values in band], axis=1)
 
 
-__all__ = ["BoundGaussians", "face_normals", "sh_basis", "vertex_normals"]
+__all__ = [
+    "BoundGaussians",
+    "TriangleBinding",
+    "face_normals",
+    "sh_basis",
+    "surface_normals",
+    "vertex_normals",
+]

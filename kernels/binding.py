@@ -199,3 +199,93 @@ def follow_triangles(
 
     scales_out[i] = wp.vec3(s0, s1, s2)
     quats_out[i] = quaternion_wxyz(moved.normal, frame_axis(moved, x, y), frame_axis(moved, -y, x))
+
+
+@wp.kernel
+def bind_triangles_backward(
+    start: int,
+    # In:
+    vertices: wp.array[wp.vec3],
+    faces: wp.array2d[int],
+    offsets: wp.array[int],
+    order: wp.array[int],
+    barycentrics: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec2],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    g_means: wp.array[wp.vec3],
+    g_quats: wp.array[wp.vec4],
+    g_scales: wp.array[wp.vec3],
+    # Out:
+    g_corners_out: wp.array2d[wp.vec3],
+    g_rotations_out: wp.array[wp.vec2],
+    g_log_scales_out: wp.array[wp.vec3],
+):
+    """Gradients of the rest pose of `follow_triangles`, one face: its Gaussians are order[offsets[f]...].
+
+    A small turn w of a Gaussian moves its quaternion by (0, w) q / 2, which gives a torque dL/dw; in the
+    plane it turns the complex number, and the sum over a face's Gaussians turns the frame, whose axes follow
+    the corners: with ab = (l, 0) and ac = (p, q) in the plane, w . e2 = -db.n / l, w . n = db.e2 / l and
+    w . e1 = (dc.n - db.n p / l) / q for corner moves db, dc relative to the first corner.
+    """
+    f = start + wp.tid()
+    a = vertices[faces[f, 0]]
+    b = vertices[faces[f, 1]]
+    c = vertices[faces[f, 2]]
+    frame = triangle_frame(a, b, c)
+    ga = wp.vec3()
+    gb = wp.vec3()
+    gc = wp.vec3()
+    torque = wp.vec3()
+    for k in range(offsets[f], offsets[f + 1]):
+        i = order[k]
+        w = barycentrics[i]
+        g = g_means[i]
+        ga += g * w[0]
+        gb += g * w[1]
+        gc += g * w[2]
+        q = quats[i]
+        h = g_quats[i]
+        turn = 0.5 * wp.vec3(
+            -h[0] * q[1] + h[1] * q[0] - h[2] * q[3] + h[3] * q[2],
+            -h[0] * q[2] + h[1] * q[3] + h[2] * q[0] - h[3] * q[1],
+            -h[0] * q[3] - h[1] * q[2] + h[2] * q[1] + h[3] * q[0],
+        )
+        torque += turn
+        z = rotations[i]
+        norm = wp.dot(z, z)
+        spin = float(0.0)
+        if norm > TINY:
+            spin = wp.dot(turn, frame.normal) / norm
+        g_rotations_out[i] = wp.vec2(-z[1] * spin, z[0] * spin)
+        g_log_scales_out[i] = wp.cw_mul(g_scales[i], scales[i])
+    if frame.edge > TINY and frame.q > TINY:
+        t1 = wp.dot(torque, frame.e1)
+        t2 = wp.dot(torque, frame.e2)
+        tn = wp.dot(torque, frame.normal)
+        tb = frame.e2 * (tn / frame.edge) - frame.normal * ((t2 + t1 * frame.p / frame.q) / frame.edge)
+        tc = frame.normal * (t1 / frame.q)
+        ga -= tb + tc
+        gb += tb
+        gc += tc
+    g_corners_out[f, 0] = ga
+    g_corners_out[f, 1] = gb
+    g_corners_out[f, 2] = gc
+
+
+@wp.kernel
+def gather_corners(
+    start: int,
+    # In:
+    offsets: wp.array[int],
+    corners: wp.array[int],
+    values: wp.array[wp.vec3],
+    # Out:
+    sums_out: wp.array[wp.vec3],
+):
+    """Sum of corner values at each vertex; its corners (3 face + corner) are corners[offsets[v]...]."""
+    v = start + wp.tid()
+    total = wp.vec3()
+    for k in range(offsets[v], offsets[v + 1]):
+        total += values[corners[k]]
+    sums_out[v] = total

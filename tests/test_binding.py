@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from gdpro_sim.binding import BoundGaussians, sh_basis, vertex_normals
+from gdpro_sim.binding import BoundGaussians, TriangleBinding, sh_basis, vertex_normals
 from gdpro_sim.device import set_thread_count, thread_count
 from gdpro_sim.errors import AssetError
-from tests.reference.binding import covariances, follow
+from gdpro_sim.gaussians import rotation_matrices
+from tests.reference.binding import bind, covariances, follow
 
 
 def make_bound(seed: int = 0, faces: int = 40, per_face: int = 3, degree: int = 0) -> BoundGaussians:
@@ -188,3 +191,60 @@ def test_normals_are_smooth_on_a_ball_and_sharp_on_a_cube() -> None:
             axis = points.abs().argmax(dim=1)
             expected = torch.nn.functional.one_hot(axis, 3) * points.gather(1, axis[:, None]).sign()
         assert (bound.normals() * expected).sum(1).min() > 0.999
+
+
+def test_learnable_binding_gives_the_bits_of_the_asset() -> None:
+    bound = make_bound(3)
+    shuffled = torch.randperm(len(bound), generator=torch.Generator().manual_seed(0))
+    bound = replace(bound, face_ids=bound.face_ids[shuffled])
+    binding = TriangleBinding(bound.faces, bound.face_ids, bound.barycentrics, len(bound.vertices))
+    means, quats, scales = binding(bound.vertices, bound.rotations, bound.log_scales)
+    rest = bound.gaussians()
+    assert torch.equal(means, rest.means)
+    assert torch.equal(quats, rest.quats)
+    assert torch.equal(scales, rest.scales)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gradients_of_the_binding_match_the_reference(seed: int) -> None:
+    """Shared vertices, face ids in any order; the loss reads rotations, not quaternions' signs."""
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    g = torch.Generator().manual_seed(seed)
+    vertices = torch.tensor(mesh.vertices).float() + 0.1 * torch.randn(len(mesh.vertices), 3, generator=g)
+    faces = torch.tensor(mesh.faces, dtype=torch.int32)
+    n = 3 * len(faces)
+    face_ids = (torch.arange(n) // 3)[torch.randperm(n, generator=g)].int()
+    weights = torch.rand(n, 3, generator=g)
+    weights /= weights.sum(1, keepdim=True)
+    rotations, log_scales = torch.randn(n, 2, generator=g), torch.randn(n, 3, generator=g)
+    factors = [
+        torch.randn(n, 3, generator=g),
+        torch.randn(n, 3, 3, generator=g),
+        torch.randn(n, 3, generator=g),
+    ]
+
+    inputs = [t.clone().requires_grad_() for t in (vertices, rotations, log_scales)]
+    means, quats, scales = TriangleBinding(faces, face_ids, weights, len(vertices))(*inputs)
+    got = sum((a * b).sum() for a, b in zip((means, rotation_matrices(quats), scales), factors, strict=True))
+    got.backward()
+
+    wanted = [t.double().requires_grad_() for t in (vertices, rotations, log_scales)]
+    rest = bind(wanted[0], faces, face_ids, weights.double(), wanted[1], wanted[2])
+    total = sum((a * b.double()).sum() for a, b in zip(rest, factors, strict=True))
+    total.backward()
+    torch.testing.assert_close(got.double(), total, rtol=1e-4, atol=1e-4)
+    for a, b in zip(inputs, wanted, strict=True):
+        scale = float(b.grad.abs().max())
+        torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-3, atol=1e-5 * scale)
+
+
+def test_a_triangle_without_area_gives_finite_gradients() -> None:
+    faces = torch.tensor([[0, 1, 2], [0, 1, 1]], dtype=torch.int32)
+    inputs = [
+        torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]).requires_grad_(),
+        torch.tensor([[1.0, 0.0], [0.0, 0.0]]).requires_grad_(),
+        torch.zeros(2, 3).requires_grad_(),
+    ]
+    binding = TriangleBinding(faces, torch.arange(2, dtype=torch.int32), torch.full((2, 3), 1 / 3), 3)
+    sum((part * torch.arange(part.numel()).view_as(part)).sum() for part in binding(*inputs)).backward()
+    assert all(torch.isfinite(t.grad).all() for t in inputs)

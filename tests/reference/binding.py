@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
@@ -52,3 +53,22 @@ def follow(bound: BoundGaussians, vertices: object) -> tuple[np.ndarray, np.ndar
         values = sh_basis(degree, directions @ turn) @ bound.sh[i].double().numpy()
         sh.append(np.linalg.lstsq(basis, values, rcond=None)[0])
     return np.array(means), np.array(covariance), np.array(sh)
+
+
+def bind(
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    face_ids: torch.Tensor,
+    barycentrics: torch.Tensor,
+    rotations: torch.Tensor,
+    log_scales: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Means [N, 3], rotation matrices [N, 3, 3] and scales [N, 3] at rest, for torch's autograd."""
+    corners = vertices[faces.long()][face_ids.long()]
+    normalize = torch.nn.functional.normalize
+    e1 = normalize(corners[:, 1] - corners[:, 0], dim=1)
+    e0 = normalize(torch.linalg.cross(e1, corners[:, 2] - corners[:, 0]), dim=1)
+    e2 = torch.linalg.cross(e0, e1)
+    x, y = normalize(rotations, dim=1).split(1, dim=1)
+    rotation = torch.stack([e0, x * e1 + y * e2, x * e2 - y * e1], dim=2)
+    return (corners * barycentrics[:, :, None]).sum(1), rotation, log_scales.exp()
