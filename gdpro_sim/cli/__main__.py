@@ -1,0 +1,3 @@
+from gdpro_sim.cli import main
+
+main()

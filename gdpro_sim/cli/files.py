@@ -1,0 +1,232 @@
+"""Commands over meshes, assets and simulations: import, simulate, render, export, info, scenes."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gdpro_sim.cli.common import (
+    AsJson,
+    Color,
+    Debug,
+    Device,
+    Quiet,
+    Seed,
+    app,
+    check_choice,
+    check_exists,
+    check_suffix,
+    first_line,
+    progress,
+    setup,
+    show,
+    table,
+)
+from gdpro_sim.errors import RequestError
+
+
+@app.command("import")
+def import_command(
+    mesh: Annotated[Path, typer.Argument(help="Mesh file: OBJ, PLY, STL, glTF/GLB, OFF, DAE, USD …")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Asset to write: .usdc, .usda or .usdz.")],
+    budget: Annotated[
+        int, typer.Option("--budget", min=100, max=5_000_000, help="Gaussians to aim for.")
+    ] = 50_000,
+    color: Color = None,
+    texture: Annotated[Path | None, typer.Option("--texture", help="Texture image of the mesh.")] = None,
+    up: Annotated[str, typer.Option("--up", help="Up axis of the file: auto, y or z.")] = "auto",
+    scale: Annotated[
+        float | None, typer.Option("--scale", help="Multiply lengths, e.g. 0.001 for mm.")
+    ] = None,
+    material: Annotated[
+        str | None, typer.Option("--material", help="Material preset stored in the asset.")
+    ] = None,
+    tets: Annotated[
+        int, typer.Option("--tets", min=0, max=500_000, help="Tetrahedra to aim for, roughly; 0 for none.")
+    ] = 6_000,
+    seed: Seed = None,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Turn a mesh into a Gaussian asset: bound Gaussians, tetrahedra, one USD file."""
+    setup(quiet, debug)
+    check_exists(mesh)
+    check_choice("--up", up, ("auto", "y", "z"))
+    check_suffix(output, (".usdc", ".usda", ".usdz"))
+    from gdpro_sim.asset import import_mesh
+    from gdpro_sim.files import check_writable
+    from gdpro_sim.materials import Material
+
+    check_writable(output)
+    chosen = None
+    if material is not None:
+        try:
+            chosen = Material.model_validate(material)
+        except ValueError as error:
+            raise RequestError(f"--material: {first_line(error)}") from None
+    begin = time.perf_counter()
+    with progress(quiet) as report:
+        asset = import_mesh(
+            mesh,
+            budget=budget,
+            color=color,
+            texture=texture,
+            up=up,
+            scale=scale,
+            material=chosen,
+            tets=tets > 0,
+            target_tets=tets or 6_000,
+            seed=seed or 0,
+            on_progress=lambda phase: report(phase, 0, 0),
+        )
+        asset.save(output)
+    summary = {"asset": str(output), **asset.summary(), "seconds": round(time.perf_counter() - begin, 2)}
+    show(summary, f"Asset {output}", json_output, quiet)
+
+
+@app.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(help="Scene file (.yaml) or the name of a shipped scene.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    device: Device = "auto",
+    seed: Seed = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Start again instead of continuing a stopped run.")
+    ] = False,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Simulate a scene and write asset, time-sampled USD, video, contact sheet and metrics.
+
+    A run that was stopped continues where it was when the same command is given again.
+    """
+    setup(quiet, debug)
+    from gdpro_sim.simulation.scene import load_scene
+
+    checked = load_scene(scene)
+    if seed is not None:
+        checked = checked.model_copy(update={"seed": seed})
+    from gdpro_sim.io.record import record
+
+    with progress(quiet) as report:
+        recording = record(checked, output, device=device, fresh=fresh, on_progress=report)
+    if json_output:
+        print(json.dumps(recording.to_json()))
+    elif not quiet:
+        rows = [("asset", str(path)) for path in recording.assets]
+        rows += [
+            ("simulation", str(recording.simulation)),
+            ("video", str(recording.video)),
+            ("contact sheet", str(recording.contact_sheet)),
+            ("metrics", str(recording.metrics)),
+            (
+                "frames",
+                f"{recording.frames}  ({recording.frame_count}, {recording.resumed_frames} of them resumed)",
+            ),
+            ("size", f"{recording.gaussians:,} Gaussians, {recording.tets:,} tetrahedra"),
+            ("seconds", "  ".join(f"{phase} {value:.1f}" for phase, value in recording.seconds.items())),
+        ]
+        table(f"Simulation of {checked.name}", rows)
+
+
+@app.command()
+def render(
+    file: Annotated[Path, typer.Argument(help="Asset or simulation (.usdc, .usda, .usdz).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the pictures.")],
+    frames: Annotated[
+        int, typer.Option("--frames", min=1, max=10_000, help="Views of an asset's turntable.")
+    ] = 24,
+    width: Annotated[int | None, typer.Option("--width", min=16, max=8192)] = None,
+    height: Annotated[int | None, typer.Option("--height", min=16, max=8192)] = None,
+    azimuth: Annotated[float | None, typer.Option("--azimuth", help="Degrees from +X.")] = None,
+    elevation: Annotated[
+        float | None, typer.Option("--elevation", min=-89.0, max=89.0, help="Degrees.")
+    ] = None,
+    fov: Annotated[float | None, typer.Option("--fov", min=1.0, max=150.0, help="Vertical, degrees.")] = None,
+    shading: Annotated[str, typer.Option("--shading", help="studio or none.")] = "studio",
+    background: Annotated[str, typer.Option("--background", help="studio, white or black.")] = "studio",
+    device: Device = "auto",
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Render an asset as a turntable, or every frame of a simulation, to PNG pictures.
+
+    A simulation is seen through its scene's camera, unless the options say otherwise.
+    """
+    setup(quiet, debug)
+    check_choice("--shading", shading, ("studio", "none"))
+    check_choice("--background", background, ("studio", "white", "black"))
+    check_exists(file)
+    view = {"azimuth": azimuth, "elevation": elevation, "fov": fov, "width": width, "height": height}
+    from gdpro_sim.io.views import render_file
+
+    with progress(quiet) as report:
+        pictures = render_file(
+            file,
+            output,
+            views=frames,
+            camera={key: value for key, value in view.items() if value is not None},
+            shading=shading,
+            background=background,
+            device=device,
+            on_progress=report,
+        )
+    show({"frames": str(output), "count": len(pictures)}, f"Pictures of {file.name}", json_output, quiet)
+
+
+@app.command()
+def export(
+    file: Annotated[Path, typer.Argument(help="Asset or simulation (.usdc, .usda, .usdz).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Gaussian splats to write: .ply.")],
+    frame: Annotated[int, typer.Option("--frame", min=0, help="Frame of a simulation.")] = 0,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Write the Gaussians as a 3DGS PLY, the file that splat viewers read."""
+    setup(quiet, debug)
+    check_exists(file)
+    check_suffix(output, (".ply",))
+    from gdpro_sim.io.ply import write_ply
+    from gdpro_sim.io.views import gaussians_of
+
+    gaussians = gaussians_of(file, frame)
+    write_ply(output, gaussians)
+    show({"ply": str(output), "gaussians": len(gaussians)}, f"Gaussians of {file.name}", json_output, quiet)
+
+
+@app.command()
+def info(
+    file: Annotated[Path, typer.Argument(help="Asset, simulation or mesh file.")],
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Say what a file holds; with --quiet, only whether it can be read."""
+    setup(quiet, debug)
+    check_exists(file)
+    from gdpro_sim.io.describe import describe
+
+    show(describe(file), str(file), json_output, quiet)
+
+
+@app.command()
+def scenes(json_output: AsJson = False, quiet: Quiet = False, debug: Debug = False) -> None:
+    """List the scenes shipped with the package; with --quiet, their names alone."""
+    setup(quiet, debug)
+    from gdpro_sim.simulation.scene import load_scene, scene_names
+
+    listing = {name: load_scene(name).description for name in scene_names()}
+    if json_output:
+        print(json.dumps(listing))
+    elif quiet:
+        print("\n".join(listing))
+    else:
+        table("Shipped scenes", list(listing.items()))
