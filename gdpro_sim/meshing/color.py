@@ -31,8 +31,9 @@ class Texture:
     def __init__(self, image: np.ndarray) -> None:
         self._levels = [image]
 
-    def _level(self, index: int) -> np.ndarray:
-        while index >= len(self._levels) and max(self._levels[-1].shape[:2]) > 1:
+    def levels(self) -> list[np.ndarray]:
+        """The image and its halvings down to one texel, each uint8 [H, W, C]."""
+        while max(self._levels[-1].shape[:2]) > 1:
             image = self._levels[-1]
             height, width = image.shape[:2]
             # Odd sizes repeat the last row or column, size 1 stays.
@@ -43,7 +44,7 @@ class Texture:
                 for col in cols:
                     total += image[row][:, col]
             self._levels.append(((total + 2) // 4).astype(np.uint8))
-        return self._levels[min(index, len(self._levels) - 1)]
+        return self._levels
 
     def sample(self, uv: np.ndarray, texels: np.ndarray | None = None) -> np.ndarray:
         """Colours in [0, 1] float32 [N, C] at `uv` [N, 2] (v up), averaged over about `texels` [N] texels
@@ -64,7 +65,8 @@ class Texture:
         return out
 
     def _bilinear(self, level: int, uv: np.ndarray) -> np.ndarray:
-        image = self._level(level)
+        levels = self.levels()
+        image = levels[min(level, len(levels) - 1)]
         height, width = image.shape[:2]
         x = uv[:, 0] * width - 0.5
         y = (1.0 - uv[:, 1]) * height - 0.5
