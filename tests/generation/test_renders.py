@@ -146,7 +146,7 @@ def test_holes_of_a_cutout_texture_show_what_is_behind() -> None:
     seen = MeshRenderer(front).render(above(3.0, 32), rays=2)
     assert float(opaque.alphas[0, 16, 12]) == float(opaque.alphas[0, 16, 20]) == 1.0
     middle = seen.alphas[0, 4:28, 4:28]
-    assert float(middle.max()) == pytest.approx(1.0)
+    assert float(middle.max()) > 0.95
     assert float(middle.min()) < 0.05
     assert float(middle.mean()) == pytest.approx(0.5, abs=0.02)
 
