@@ -1,0 +1,147 @@
+"""What an iteration of either stage has in common: views, pictures for the guidance, the score, the clock."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import torch
+
+from gdpro_sim.cameras import Cameras
+from gdpro_sim.generation.cameras import Background, CameraSchedule
+from gdpro_sim.generation.config import GenerationConfig
+from gdpro_sim.generation.guidance.closed_form import ClosedFormScore
+from gdpro_sim.generation.ism import ScoreDistillation
+from gdpro_sim.generation.protocols import Guidance, ViewBatch, step_generator
+from gdpro_sim.generation.renders import disparity
+from gdpro_sim.splatting import losses
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What C cameras see of what is learned, before it is reduced for the guidance; with gradients.
+
+    rgb [C, H, W, 3] over the views' backgrounds, depths [C, H, W, 1] expected z, alphas [C, H, W, 1]
+    """
+
+    cameras: Cameras
+    rgb: torch.Tensor
+    depths: torch.Tensor
+    alphas: torch.Tensor
+
+
+class Clock:
+    """Wall time of a step by part."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(("render", "guidance", "backward", "optimizer", "other"), 0.0)
+        self._start = time.perf_counter()
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - begin
+
+    def stop(self) -> dict[str, float]:
+        """Seconds by part; what no part took is "other"."""
+        whole = time.perf_counter() - self._start
+        self.seconds["other"] = max(0.0, whole - sum(self.seconds.values()))
+        return self.seconds
+
+
+class Distillation:
+    """Score distillation for one stage: chooses views, reduces pictures, asks the guidance.
+
+    resolution: pixels across a rendered view; the guidance sees it reduced by `supersample`
+    """
+
+    def __init__(
+        self,
+        stage: str,
+        guidance: Guidance,
+        config: GenerationConfig,
+        seed: int,
+        *,
+        iterations: int,
+        batch: int,
+        resolution: int,
+        supersample: int,
+        background: Background,
+    ) -> None:
+        self.stage, self.guidance, self.seed = stage, guidance, seed
+        self.iterations, self.batch, self.supersample = iterations, batch, supersample
+        self.background: Background = background
+        self.score = ScoreDistillation(guidance, config.score)
+        self.schedule = CameraSchedule(config.cameras, max(1, resolution // supersample))
+        self.depth_probability = config.score.depth_probability
+
+    @property
+    def device(self) -> torch.device:
+        """Where the guidance works, and so the stage."""
+        return self.guidance.alphas_cumprod.device
+
+    def look(self, iteration: int) -> tuple[ViewBatch, torch.Generator]:
+        """Views of this iteration as the guidance sees them, and the iteration's random numbers."""
+        generator = step_generator(self.seed, self.stage, iteration)
+        views = self.schedule.sample(
+            iteration, self.iterations, self.batch, generator, background=self.background
+        )
+        if float(torch.rand((), generator=generator)) < self.depth_probability:
+            views = replace(views, kind="disparity")
+        return self.guidance.views(views, generator), generator
+
+    def rendered(self, views: ViewBatch) -> tuple[Cameras, torch.Tensor]:
+        """Cameras to render for `views`, finer by `supersample`, and backgrounds [C, 3]; on the device."""
+        cameras, factor = views.cameras, self.supersample
+        Ks = cameras.Ks.clone()
+        Ks[:, :2] *= factor
+        finer = Cameras(
+            cameras.viewmats.to(self.device),
+            Ks.to(self.device),
+            cameras.width * factor,
+            cameras.height * factor,
+        )
+        return finer, views.backgrounds.to(self.device)
+
+    def pictures(self, shot: Shot, views: ViewBatch) -> torch.Tensor:
+        """What the guidance is shown: colours or disparity, reduced; [C, H, W, 3]."""
+        image = shot.rgb
+        if views.kind == "disparity":
+            image = disparity(shot.depths, shot.alphas, shot.cameras)
+        if self.supersample == 1:
+            return image
+        planes = torch.nn.functional.avg_pool2d(image.permute(0, 3, 1, 2), self.supersample)
+        return planes.permute(0, 2, 3, 1)
+
+    def judge(
+        self, images: torch.Tensor, views: ViewBatch, iteration: int, generator: torch.Generator
+    ) -> tuple[torch.Tensor, float | None]:
+        """The score's loss, and PSNR of colour pictures where the guidance knows the right ones."""
+        loss, _ = self.score.loss(images, views, iteration, generator)
+        psnr = None
+        if views.kind == "rgb" and isinstance(self.guidance, ClosedFormScore):
+            psnr = self.guidance.psnr(images, views)
+        return loss, psnr
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return self.score.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        self.score.load_state_dict(state)
+
+
+def variation(shot: Shot) -> torch.Tensor:
+    """Total variation of colour and of disparity; one number."""
+    grey = disparity(shot.depths, shot.alphas, shot.cameras)[..., :1]
+    return losses.total_variation(shot.rgb) + losses.total_variation(grey)
+
+
+def nested(state: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    """Entries `prefix.NAME` of a flat state as `NAME`."""
+    return {k.removeprefix(f"{prefix}."): v for k, v in state.items() if k.startswith(f"{prefix}.")}
+
+
+__all__ = ["Clock", "Distillation", "Shot", "nested", "variation"]
