@@ -23,6 +23,7 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from gdpro_sim.device import beside_torch
 from gdpro_sim.errors import GuidanceError
 from gdpro_sim.generation.config import ScoreConfig
 from gdpro_sim.generation.diffusion import Schedule, add_noise, ddim_move, weighted_residual
@@ -115,9 +116,10 @@ class ScoreDistillation:
 
     def noise(self, x0: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Noise of x_0's shape [B, h, w, c]: N(0, 1) plus a part that a channel of all pictures shares."""
-        own = torch.randn(x0.shape, generator=generator, device=generator.device)
-        shared = torch.randn(x0.shape[-1], generator=generator, device=generator.device)
-        return (own + self.config.shared_noise * shared).to(x0.device)
+        with beside_torch(x0):
+            own = torch.randn(x0.shape, generator=generator, device=generator.device)
+            shared = torch.randn(x0.shape[-1], generator=generator, device=generator.device)
+            return (own + self.config.shared_noise * shared).to(x0.device)
 
     def inversion_steps(self, s: int) -> list[int]:
         """Steps 1, stride, 2 stride, ... s that the inversion visits.

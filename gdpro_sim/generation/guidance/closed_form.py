@@ -22,6 +22,7 @@ from typing import Any
 
 import torch
 
+from gdpro_sim.device import beside_torch
 from gdpro_sim.errors import GuidanceError
 from gdpro_sim.generation.diffusion import Schedule, combine, guidance_mix, scaled_linear_schedule
 from gdpro_sim.generation.protocols import Condition, ViewBatch
@@ -102,10 +103,11 @@ class ClosedFormScore(ABC):
             return torch.zeros_like(x_t)
         signal, sigma = self._schedule.signal(t), self._schedule.sigma(t)
         variance = signal**2 * self.kernel_width**2 + sigma**2
-        targets = self._shifted(self.reference(views), views)
-        mean = targets[0]
-        if len(targets) > 1:
-            with torch.no_grad():
+        targets = self.reference(views)
+        with torch.no_grad(), beside_torch(x_t):
+            targets = self._shifted(targets, views)
+            mean = targets[0]
+            if len(targets) > 1:
                 squares = (x_t - signal * targets).double().square().sum((2, 3, 4))
                 weights = torch.softmax(-squares / (2.0 * variance), 0).to(targets.dtype)
                 mean = torch.einsum("kb,kbhwc->bhwc", weights, targets)
