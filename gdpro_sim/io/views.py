@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from gdpro_sim.asset import Asset, kind
-from gdpro_sim.cameras import Cameras
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import RequestError
 from gdpro_sim.files import prepare_folder, remove_stale
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.images import frame_name, remove_frames_from, write_png
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
+from gdpro_sim.io.turntable import studio_around, turntable_cameras
 from gdpro_sim.io.usd import SimulationReader
 from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.scene import Camera
@@ -59,7 +59,8 @@ def render_file(
         gaussians, normals = bound.gaussians(), bound.normals()
         low, high = bound.vertices.amin(0).cpu().numpy(), bound.vertices.amax(0).cpu().numpy()
         renderer = Renderer(
-            _turntable(low, high, views, view), _studio(low, high, float(low[2]), shading, background)
+            turntable_cameras(low, high, views, view),
+            studio_around(low, high, float(low[2]), shading, background),
         )
         for index in range(views):
             write(renderer.render(gaussians, normals, index), views)
@@ -84,7 +85,7 @@ def _recorded(reader: SimulationReader, camera: dict[str, Any], shading: str, ba
         boxes = np.array([_bounds(reader.frame(i)) for i in sorted({0, len(reader) // 2, len(reader) - 1})])
         low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
         view = {**Camera().model_dump(), **camera}
-        return Renderer(frame_camera(low, high, **view), _studio(low, high, None, shading, background))
+        return Renderer(frame_camera(low, high, **view), studio_around(low, high, None, shading, background))
     view = {**scene["camera"], **camera}
     if {"azimuth", "elevation"} & set(camera):
         view["eye"] = None
@@ -114,24 +115,6 @@ def _kind(path: Path) -> str:
             f"gdpro import {path} -o {path.stem}.usdc"
         )
     return what
-
-
-def _turntable(low: np.ndarray, high: np.ndarray, views: int, view: dict[str, Any]) -> Cameras:
-    turns = [
-        frame_camera(low, high, **{**view, "azimuth": view["azimuth"] + 360.0 * i / views})
-        for i in range(views)
-    ]
-    return Cameras(
-        torch.cat([t.viewmats for t in turns]),
-        torch.cat([t.Ks for t in turns]),
-        turns[0].width,
-        turns[0].height,
-    )
-
-
-def _studio(low: np.ndarray, high: np.ndarray, ground: float | None, shading: str, background: str) -> Studio:
-    x, y, z = (0.5 * (low + high)).tolist()
-    return Studio(shading, background, ground, float((high - low).max()), (x, y, z))
 
 
 def _bounds(frame: Frame) -> tuple[np.ndarray, np.ndarray]:

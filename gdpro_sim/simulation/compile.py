@@ -26,6 +26,11 @@ FALLBACK_MATERIAL = "jelly"
 def check_files(scene: Scene) -> None:
     """Raise SceneError for the first file a scene names that does not exist."""
     for body in scene.bodies:
+        if body.prompt is not None:
+            raise SceneError(
+                f"{scene.name}: bodies[{body.name}].prompt: generate it first (`gdpro simulate` and "
+                "gdpro_sim.record do), and give the asset's file"
+            )
         for key in ("asset", "texture"):
             reference = getattr(body, key)
             if reference is not None and not scene.resolve(reference).exists():

@@ -39,9 +39,15 @@ class SceneBody(_Strict):
         default="", pattern=r"^([A-Za-z_][A-Za-z0-9_]*)?$", description="unique; default: from the file"
     )
     asset: str = Field(
-        min_length=1,
+        default="",
         description="asset (.usdc, .usda, .usdz) or mesh file, relative to the scene file; "
         "`package:NAME/PATH` is a file inside an installed Python package",
+    )
+    prompt: str | None = Field(
+        default=None, min_length=1, description="in place of `asset`: words to generate one from"
+    )
+    quality: Literal["draft", "default", "high"] = Field(
+        default="default", description="of what a prompt generates"
     )
     color: str | None = Field(default=None, description="colour of a mesh, #rrggbb or a CSS name")
     texture: str | None = Field(
@@ -71,11 +77,20 @@ class SceneBody(_Strict):
     @model_validator(mode="before")
     @classmethod
     def _name_from_file(cls, value: Any) -> Any:
-        if isinstance(value, dict) and not value.get("name") and isinstance(value.get("asset"), str):
-            stem = Path(value["asset"]).stem
+        if isinstance(value, dict) and not value.get("name"):
+            source = value.get("asset") or value.get("prompt")
+            if not isinstance(source, str):
+                return value
+            stem = Path(source).stem if value.get("asset") else source.strip()
             safe = "".join(ch if ch.isascii() and ch.isalnum() else "_" for ch in stem)
             value = {**value, "name": safe if safe[:1].isalpha() else f"body_{safe}"}
         return value
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SceneBody:
+        if bool(self.asset) == (self.prompt is not None):
+            raise ValueError("give either `asset` (a file) or `prompt` (words), one of the two")
+        return self
 
 
 class GroundPlane(_Strict):
@@ -187,12 +202,36 @@ def scene_names() -> list[str]:
     return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
+def drop_scene(asset: str | Path) -> Scene:
+    """The default scene of one asset file: it falls from half its size, a little tilted.
+
+    Raises AssetError for a file that cannot be read, SceneError for one that is no asset.
+    """
+    from gdpro_sim.asset import Asset, kind
+
+    path = Path(asset).expanduser().resolve()
+    if kind(path) != "asset":
+        raise SceneError(f"{path} is no asset; make one of it: gdpro import {path} -o {path.stem}_asset.usdc")
+    height = 0.5 * max(Asset.load(path).summary()["size"])
+    body = {"asset": str(path), "position": (0.0, 0.0, height), "rotation": (8.0, -6.0, 20.0)}
+    data = {
+        "name": path.stem,
+        "description": "An asset falls on the floor.",
+        "bodies": [body],
+        "solver": {"substeps": 4},
+        "duration": 1.5,
+    }
+    return check_scene(data, str(path))
+
+
 def load_scene(scene: str | Path) -> Scene:
-    """Read a scene from a YAML path, or a shipped scene by name.
+    """Read a scene from a YAML path, or a shipped scene by name; an asset file gets `drop_scene`.
 
     Raises SceneError naming the file, the key and what is allowed.
     """
     path = Path(scene).expanduser()
+    if path.suffix.lower() in (".usdc", ".usda", ".usdz"):
+        return drop_scene(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         names = scene_names()
         if str(scene) not in names:
@@ -316,6 +355,7 @@ __all__ = [
     "SceneBody",
     "SolverOptions",
     "check_scene",
+    "drop_scene",
     "load_scene",
     "scene_names",
 ]
