@@ -79,6 +79,104 @@ PRESETS: dict[str, dict[str, float]] = {
         "friction": 0.35,
         "rayleigh_stiffness": 1.0e-5,
     },
+    # Gold, silver and copper C11000 (Callister, appendix B).
+    "gold": {
+        "young": 7.7e10,
+        "poisson": 0.42,
+        "density": 19320.0,
+        "friction": 0.35,
+        "rayleigh_stiffness": 1e-5,
+    },
+    "silver": {
+        "young": 7.4e10,
+        "poisson": 0.37,
+        "density": 10490.0,
+        "friction": 0.35,
+        "rayleigh_stiffness": 1e-5,
+    },
+    "copper": {
+        "young": 1.15e11,
+        "poisson": 0.33,
+        "density": 8890.0,
+        "friction": 0.35,
+        "rayleigh_stiffness": 1e-5,
+    },
+    # Soda-lime glass (Callister, appendix B).
+    "glass": {
+        "young": 6.9e10,
+        "poisson": 0.23,
+        "density": 2500.0,
+        "friction": 0.4,
+        "rayleigh_stiffness": 1e-5,
+    },
+    # ABS (Ashby, Materials Selection in Mechanical Design, appendix: 1.1 to 2.9 GPa).
+    "plastic": {
+        "young": 2.0e9,
+        "poisson": 0.39,
+        "density": 1050.0,
+        "friction": 0.35,
+        "rayleigh_stiffness": 2e-5,
+    },
+    # Leather, cardboard and paper, brick (same appendix; middle of the ranges).
+    "leather": {
+        "young": 3.0e8,
+        "poisson": 0.40,
+        "density": 930.0,
+        "friction": 0.6,
+        "rayleigh_stiffness": 1e-4,
+    },
+    "paper": {"young": 5.0e9, "poisson": 0.30, "density": 670.0, "friction": 0.5, "rayleigh_stiffness": 5e-5},
+    "brick": {
+        "young": 2.0e10,
+        "poisson": 0.20,
+        "density": 2000.0,
+        "friction": 0.6,
+        "rayleigh_stiffness": 1e-5,
+    },
+    # Granite and limestone lie at 50 to 70 GPa (Goodman, Introduction to Rock Mechanics, 2nd ed., table 6.1).
+    "stone": {
+        "young": 5.0e10,
+        "poisson": 0.25,
+        "density": 2650.0,
+        "friction": 0.6,
+        "rayleigh_stiffness": 1e-5,
+    },
+    # Concrete C30/37 (EN 1992-1-1, table 3.1; EN 1991-1-1 for its weight).
+    "concrete": {
+        "young": 3.3e10,
+        "poisson": 0.20,
+        "density": 2400.0,
+        "friction": 0.6,
+        "rayleigh_stiffness": 1e-5,
+    },
+    # Ice at -10 C and seasonal snow (Petrovic 2003, J. Mater. Sci. 38; snow: an order of magnitude).
+    "ice": {"young": 9.5e9, "poisson": 0.33, "density": 917.0, "friction": 0.05, "rayleigh_stiffness": 1e-5},
+    "snow": {"young": 1.0e7, "poisson": 0.25, "density": 300.0, "friction": 0.3, "rayleigh_stiffness": 5e-4},
+    # Apple flesh, 2 to 6 MPa (Mohsenin, Physical Properties of Plant and Animal Materials, 2nd ed.).
+    "fruit": {"young": 4.0e6, "poisson": 0.30, "density": 840.0, "friction": 0.5, "rayleigh_stiffness": 3e-4},
+    # Turgid soft plant tissue (parenchyma, 1 to 10 MPa: Niklas, Plant Biomechanics, 1992).
+    "plant": {"young": 8.0e6, "poisson": 0.30, "density": 950.0, "friction": 0.5, "rayleigh_stiffness": 3e-4},
+    # Bread and cake crumb, an open foam of the order of 10 kPa (Scanlon & Zghal 2001, Food Res. Int. 34).
+    "bread": {"young": 1.5e4, "poisson": 0.25, "density": 250.0, "friction": 0.6, "rayleigh_stiffness": 4e-3},
+    # Semi-hard cheese such as Gouda, some 0.3 MPa in slow compression; order of magnitude.
+    "cheese": {
+        "young": 3.0e5,
+        "poisson": 0.45,
+        "density": 1080.0,
+        "friction": 0.5,
+        "rayleigh_stiffness": 1e-3,
+    },
+    # Solid chocolate and paraffin wax at room temperature, some 0.2 GPa each; orders of magnitude.
+    "chocolate": {
+        "young": 2.0e8,
+        "poisson": 0.35,
+        "density": 1300.0,
+        "friction": 0.4,
+        "rayleigh_stiffness": 1e-4,
+    },
+    "wax": {"young": 2.0e8, "poisson": 0.40, "density": 900.0, "friction": 0.3, "rayleigh_stiffness": 1e-4},
+    # Cloth over polyester filling: as a very light soft foam; chosen.
+    "plush": {"young": 2.0e4, "poisson": 0.25, "density": 50.0, "friction": 0.7, "rayleigh_stiffness": 5e-3},
 }
 """Named presets. Sources stand beside each; friction is against a dry floor, damping is chosen."""
 
