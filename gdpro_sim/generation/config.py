@@ -131,7 +131,9 @@ class CameraConfig(_Part):
     fov_late: tuple[float, float] = Field(
         default=(0.34, 0.50), description="vertical, rad, at the end (code: 0.16 to 0.60)"
     )
-    polar: tuple[float, float] = Field(default=(30.0, 150.0), description="degrees from +Z (paper)")
+    polar: tuple[float, float] = Field(
+        default=(15.0, 150.0), description="degrees from +Z (paper: 30 to 150; ours looks into vessels)"
+    )
     jitter_centre: float = Field(default=0.03, ge=0.0, description="standard deviation of the eye (code)")
     jitter_target: float = Field(
         default=0.03, ge=0.0, description="standard deviation of the point looked at (code)"
@@ -254,7 +256,7 @@ class OutputConfig(_Part):
     checkpoint_every: int = Field(default=50, ge=1, description="iterations between checkpoints")
     tets: bool = Field(
         default=False,
-        description="fill the asset with tetrahedra now; they do not repeat to the bit (else: when simulated)",
+        description="fill with tetrahedra now; they do not repeat to the bit (else: when simulated)",
     )
     target_tets: int = Field(default=6000, ge=50, description="about how many")
     material: str | None = Field(default=None, description="physical preset; none: what the prior proposes")
@@ -301,7 +303,12 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "refinement": {"iterations": 900, "resolution": 320},
     },
     "paper": {
-        "cameras": {"radius_late": (3.5, 5.0), "fov": (0.32, 0.60), "fov_late": (0.16, 0.60)},
+        "cameras": {
+            "polar": (30.0, 150.0),
+            "radius_late": (3.5, 5.0),
+            "fov": (0.32, 0.60),
+            "fov_late": (0.16, 0.60),
+        },
         "surfels": {
             "iterations": 5000,
             "batch": 4,
