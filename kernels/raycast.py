@@ -1,4 +1,4 @@
-"""Pictures of a coloured triangle mesh: rays are cast, colours looked up and subsamples averaged in one go.
+"""Pictures of a coloured triangle mesh: a ray for each pixel, and several where neighbours differ.
 
 Stored colours are sRGB-encoded and are interpolated and averaged as they are stored; a texture times a corner
 colour is a product in linear light (glTF 2.0, section 3.9.2).
@@ -124,8 +124,72 @@ def color_at(surface: Surface, face: int, u: float, v: float, area: float) -> wp
     return times(image, color)
 
 
+@wp.struct
+class Sample:
+    """Sums over rays: colour times opacity, opacity, z times opacity, normal times opacity."""
+
+    rgb: wp.vec3
+    alpha: float
+    depth: float
+    normal: wp.vec3
+
+
+@wp.struct
+class View:
+    """One camera: inverse_k takes pixels to camera axes at depth 1, to_world those axes to the world's."""
+
+    eye: wp.vec3
+    to_world: wp.mat33
+    inverse_k: wp.mat33
+
+
+@wp.func
+def view_of(
+    camera: int, eyes: wp.array[wp.vec3], rotations: wp.array[wp.mat33], inverse_ks: wp.array[wp.mat33]
+) -> View:
+    view = View()
+    view.eye = eyes[camera]
+    view.to_world = wp.transpose(rotations[camera])
+    view.inverse_k = inverse_ks[camera]
+    return view
+
+
+@wp.func
+def cast(surface: Surface, view: View, x: float, y: float, patch: float, sample: Sample) -> Sample:
+    """Add what a ray through pixel coordinates (x, y) sees; `patch` is its area at depth 1."""
+    direction = view.to_world * (view.inverse_k * wp.vec3(x, y, 1.0))  # one unit of depth long
+    begin = float(0.0)
+    left = float(1.0)
+    for _layer in range(LAYERS):
+        hit = wp.mesh_query_ray(surface.mesh, view.eye + direction * begin, direction, 1.0e10)
+        if not hit.result:
+            break
+        z = begin + hit.t
+        color = color_at(surface, hit.face, hit.u, hit.v, patch * z * z)
+        weight = left * color[3]
+        sample.rgb += wp.vec3(color[0], color[1], color[2]) * weight
+        sample.alpha += weight
+        sample.depth += weight * z
+        if surface.corner_normals.shape[0] > 0:
+            n = (
+                surface.corner_normals[3 * hit.face] * hit.u
+                + surface.corner_normals[3 * hit.face + 1] * hit.v
+                + surface.corner_normals[3 * hit.face + 2] * (1.0 - hit.u - hit.v)
+            )
+            n = wp.normalize(n)
+            # The face, not the interpolated normal, says which side is seen.
+            if wp.dot(hit.normal, direction) > 0.0:
+                n = -n
+            sample.normal += n * weight
+        if color[3] >= OPAQUE:
+            break
+        left *= 1.0 - color[3]
+        begin = z + LIFT
+    return sample
+
+
 @wp.kernel
-def draw_surface(
+def draw_centres(
     start: int,
     # In:
     surface: Surface,
@@ -141,62 +205,80 @@ def draw_surface(
     depth_out: wp.array[float],
     normal_out: wp.array[wp.vec3],
 ):
-    """Mean of rays x rays rays of one pixel: colour times opacity, opacity, mean z of what is seen, normals.
+    """One ray through each pixel's centre: colour times opacity, opacity, mean z of what is seen, normal.
 
-    Faces are seen from either side. `rotations` are world to camera. Normals are summed times opacity and
-    look towards the camera; they are left out where the surface has none.
+    `rays` is how many across a pixel there will be at most: it sets how much of a texture one stands for.
+    Normals are times opacity and look towards the camera; they are left out where the surface has none.
     """
     i = start + wp.tid()
-    camera = i // (width * height)
+    view = view_of(i // (width * height), eyes, rotations, inverse_ks)
+    patch = wp.abs(view.inverse_k[0, 0] * view.inverse_k[1, 1]) / float(rays * rays)
+    x = float(i % width) + 0.5
+    y = float((i // width) % height) + 0.5
+    sample = cast(surface, view, x, y, patch, Sample())
+    rgb_out[i] = sample.rgb
+    alpha_out[i] = sample.alpha
+    depth_out[i] = 0.0
+    if sample.alpha > 0.0:
+        depth_out[i] = sample.depth / sample.alpha
+    if surface.corner_normals.shape[0] > 0:
+        normal_out[i] = sample.normal
+
+
+@wp.kernel
+def refine_edges(
+    start: int,
+    # In:
+    surface: Surface,
+    eyes: wp.array[wp.vec3],
+    rotations: wp.array[wp.mat33],
+    inverse_ks: wp.array[wp.mat33],
+    width: int,
+    height: int,
+    rays: int,
+    tolerance: float,
+    depth_tolerance: float,
+    rgb: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    depth: wp.array[float],
+    # Out:
+    rgb_out: wp.array[wp.vec3],
+    alpha_out: wp.array[float],
+    depth_out: wp.array[float],
+    normal_out: wp.array[wp.vec3],
+):
+    """The mean of rays x rays rays where a pixel's centre differs from one of its eight neighbours.
+
+    Differing: a colour or opacity by more than `tolerance`, z by more than `depth_tolerance`. Other pixels
+    keep what is there.
+    """
+    i = start + wp.tid()
     row = (i // width) % height
     column = i % width
-    eye = eyes[camera]
-    to_world = wp.transpose(rotations[camera])
-    inverse = inverse_ks[camera]
-    # A ray's patch at depth 1: the texture is averaged over it.
-    patch = wp.abs(inverse[0, 0] * inverse[1, 1]) / float(rays * rays)
-    with_normals = surface.corner_normals.shape[0] > 0
-    rgb = wp.vec3(0.0, 0.0, 0.0)
-    alpha = float(0.0)
-    depth = float(0.0)
-    normal = wp.vec3(0.0, 0.0, 0.0)
+    edge = bool(False)
+    for k in range(9):
+        r = row + k // 3 - 1
+        c = column + k % 3 - 1
+        if r >= 0 and r < height and c >= 0 and c < width:
+            j = i + (r - row) * width + (c - column)
+            apart = wp.max(wp.abs(rgb[j] - rgb[i]))
+            apart = wp.max(apart, wp.abs(alpha[j] - alpha[i]))
+            if apart > tolerance or wp.abs(depth[j] - depth[i]) > depth_tolerance:
+                edge = True
+    if not edge:
+        return
+    view = view_of(i // (width * height), eyes, rotations, inverse_ks)
+    patch = wp.abs(view.inverse_k[0, 0] * view.inverse_k[1, 1]) / float(rays * rays)
+    sample = Sample()
     for k in range(rays * rays):
         x = float(column) + (float(k % rays) + 0.5) / float(rays)
         y = float(row) + (float(k // rays) + 0.5) / float(rays)
-        local = inverse * wp.vec3(x, y, 1.0)
-        direction = to_world * local  # one unit of depth long
-        begin = float(0.0)
-        left = float(1.0)
-        for _layer in range(LAYERS):
-            hit = wp.mesh_query_ray(surface.mesh, eye + direction * begin, direction, 1.0e10)
-            if not hit.result:
-                break
-            z = begin + hit.t
-            color = color_at(surface, hit.face, hit.u, hit.v, patch * z * z)
-            weight = left * color[3]
-            rgb += wp.vec3(color[0], color[1], color[2]) * weight
-            alpha += weight
-            depth += weight * z
-            if with_normals:
-                n = (
-                    surface.corner_normals[3 * hit.face] * hit.u
-                    + surface.corner_normals[3 * hit.face + 1] * hit.v
-                    + surface.corner_normals[3 * hit.face + 2] * (1.0 - hit.u - hit.v)
-                )
-                n = wp.normalize(n)
-                # The face, not the interpolated normal, says which side is seen.
-                if wp.dot(hit.normal, direction) > 0.0:
-                    n = -n
-                normal += n * weight
-            if color[3] >= OPAQUE:
-                break
-            left *= 1.0 - color[3]
-            begin = z + LIFT
+        sample = cast(surface, view, x, y, patch, sample)
     share = 1.0 / float(rays * rays)
-    rgb_out[i] = rgb * share
-    alpha_out[i] = alpha * share
+    rgb_out[i] = sample.rgb * share
+    alpha_out[i] = sample.alpha * share
     depth_out[i] = 0.0
-    if alpha > 0.0:
-        depth_out[i] = depth / alpha
-    if with_normals:
-        normal_out[i] = normal
+    if sample.alpha > 0.0:
+        depth_out[i] = sample.depth / sample.alpha
+    if surface.corner_normals.shape[0] > 0:
+        normal_out[i] = sample.normal

@@ -6,6 +6,7 @@ Colours are plain sRGB-encoded albedo: no light is put on them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,12 @@ from gdpro_sim.splatting import rasterization
 
 FLOOR = 0.1
 """Disparity of the farthest point of the object: above the 0 of nothing."""
+
+TOLERANCE = 3.0 / 255.0
+"""Neighbouring pixels whose colours and opacities differ by no more are one ray each."""
+
+DEPTH_TOLERANCE = 0.05
+"""The same for depth, in the unit frame."""
 
 SMOOTH = 0.8
 """Cosine between a face's and a vertex's normal above which the edge between them is drawn round."""
@@ -93,7 +100,11 @@ class MeshRenderer:
         self._surface = surface
 
     def render(self, cameras: Cameras, rays: int = 2) -> Renders:
-        """Pictures from C cameras, each pixel the mean of `rays` x `rays` rays."""
+        """Pictures from C cameras.
+
+        A pixel is the mean of `rays` x `rays` rays where its centre differs from a neighbour's by more than
+        `TOLERANCE` in colour or opacity or `DEPTH_TOLERANCE` in depth; else its centre.
+        """
         count, width, height = len(cameras), cameras.width, cameras.height
         on = torch.device(self.device)
 
@@ -102,28 +113,25 @@ class MeshRenderer:
 
         rgb, alphas, depths = empty(3), empty(1), empty(1)
         normals = empty(3) if self._normals else None
-        inverse = torch.linalg.inv(cameras.Ks.double()).float()
-        launch_chunked(
-            raycast.draw_surface,
-            count * height * width,
-            [
-                self._surface,
-                self._array(cameras.positions.cpu().numpy(), wp.vec3),
-                self._array(cameras.viewmats[:, :3, :3].cpu().numpy(), wp.mat33),
-                self._array(inverse.cpu().numpy(), wp.mat33),
-                width,
-                height,
-                rays,
-            ],
-            [
-                wp.from_torch(rgb.view(-1, 3), dtype=wp.vec3),
-                wp.from_torch(alphas.view(-1)),
-                wp.from_torch(depths.view(-1)),
-                wp.from_torch(normals.view(-1, 3), dtype=wp.vec3) if normals is not None else None,
-            ],
-            device=self.device,
-            minimum=512,
-        )
+        inputs = [
+            self._surface,
+            self._array(cameras.positions.cpu().numpy(), wp.vec3),
+            self._array(cameras.viewmats[:, :3, :3].cpu().numpy(), wp.mat33),
+            self._array(torch.linalg.inv(cameras.Ks.double()).cpu().numpy(), wp.mat33),
+            width,
+            height,
+            rays,
+        ]
+        outputs = _flat(rgb, alphas, depths, normals)
+        launch = partial(launch_chunked, count=count * height * width, device=self.device, minimum=512)
+        launch(raycast.draw_centres, inputs=inputs, outputs=outputs)
+        if rays > 1:
+            centres = _flat(rgb.clone(), alphas.clone(), depths.clone())[:3]
+            launch(
+                raycast.refine_edges,
+                inputs=[*inputs, TOLERANCE, DEPTH_TOLERANCE, *centres],
+                outputs=outputs,
+            )
         if normals is not None:
             normals = torch.nn.functional.normalize(normals, dim=-1)
         return Renders(cameras, rgb, alphas, depths, normals)
@@ -193,6 +201,18 @@ class GaussianRenderer:
         )
         rgb, depths = image[..., :3], image[..., 3:]
         return Renders(cameras, torch.minimum(rgb, alphas), alphas, torch.where(alphas > 0.0, depths, 0.0))
+
+
+def _flat(
+    rgb: torch.Tensor, alphas: torch.Tensor, depths: torch.Tensor, normals: torch.Tensor | None = None
+) -> list[Any]:
+    """Pictures as Warp arrays over pixels."""
+    return [
+        wp.from_torch(rgb.view(-1, 3), dtype=wp.vec3),
+        wp.from_torch(alphas.view(-1)),
+        wp.from_torch(depths.view(-1)),
+        None if normals is None else wp.from_torch(normals.view(-1, 3), dtype=wp.vec3),
+    ]
 
 
 def corner_normals(mesh: SurfaceMesh) -> np.ndarray:
