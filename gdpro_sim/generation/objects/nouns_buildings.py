@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from gdpro_sim.generation.objects.parts import Paint, Part, Variation, noun, rgb
-from gdpro_sim.generation.objects.sdf import Shape, box, capsule, extrude, union
-
-
-def gable(x: float, y: float, rise: float) -> Shape:
-    """A triangular prism on z = 0, its ridge along X."""
-    return extrude([(-0.5 * y, 0.0), (0.5 * y, 0.0), (0.0, rise)], x).at(z=-0.5 * x).rx(90).rz(90)
+from gdpro_sim.generation.objects.sdf import box, capsule, union
+from gdpro_sim.generation.objects.shapes import gable
 
 
 @noun("house", "cottage", "home", kind="buildings", across=9.0, material="wood")

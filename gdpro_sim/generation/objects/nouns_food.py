@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from gdpro_sim.generation.objects.parts import Part, Variation, color, noun, rgb
 from gdpro_sim.generation.objects.sdf import (
-    Field,
     box,
     curved_tube,
     ellipsoid,
@@ -14,6 +11,7 @@ from gdpro_sim.generation.objects.sdf import (
     smooth_profile,
     torus,
 )
+from gdpro_sim.generation.objects.shapes import wave
 
 
 @noun("apple", kind="food", across=0.085, material="fruit")
@@ -42,11 +40,6 @@ def apple(v: Variation) -> list[Part]:
         Part("stem", stem, rgb("6b4a2f")),
         Part("leaf", leaf, rgb("5d9a43")),
     ]
-
-
-def wave(count: int, phase: float) -> Field:
-    """A wave of `count` periods around the Z axis, for dripping edges."""
-    return lambda p: np.sin(count * np.arctan2(p[1], p[0]) + np.float32(phase))
 
 
 @noun("donut", "doughnut", kind="food", across=0.10, material="bread")

@@ -3,17 +3,8 @@
 from __future__ import annotations
 
 from gdpro_sim.generation.objects.parts import Part, Variation, noun, rgb
-from gdpro_sim.generation.objects.sdf import Point2, Shape, box, cylinder, extrude, sphere, union
-
-
-def side_view(outline: list[Point2], width: float, round: float = 0.0) -> Shape:
-    """A solid from its outline (x, z) seen from the side, `width` across Y."""
-    return extrude([(x, z) for x, z in outline], width, round).at(z=-0.5 * width).rx(90)
-
-
-def wheel(radius: float, width: float) -> Shape:
-    """A disc with its axle along Y, centred."""
-    return cylinder(radius, width, 0.25 * width).at(z=-0.5 * width).rx(90)
+from gdpro_sim.generation.objects.sdf import box, cylinder, sphere, union
+from gdpro_sim.generation.objects.shapes import side_view, wheel
 
 
 @noun("car", "automobile", "sedan", "hatchback", kind="vehicles", across=4.0, material="steel")

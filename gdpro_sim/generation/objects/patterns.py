@@ -134,6 +134,15 @@ def streaks(p: np.ndarray, seed: int) -> np.ndarray:
     return smoothstep(0.45, 0.85, fractal_noise(ring.astype(np.float32), seed, 2)) * (0.35 + 0.65 * fade)
 
 
+def weave(p: np.ndarray, seed: int) -> np.ndarray:
+    """Wicker: over and under in alternate rows."""
+    turn = np.arctan2(p[1], p[0]) / np.float32(2 * np.pi) * 22.0
+    row = p[2] / np.float32(0.055)
+    return _square(row, 0.2, 0.08) + 0.45 * _square(0.5 * turn + 0.5 * np.floor(row + 0.5), 0.5, 0.1) * (
+        1.0 - _square(row, 0.2, 0.08)
+    )
+
+
 WEIGHTS: dict[str, Weight] = {
     "striped": stripes,
     "checkered": checker,
@@ -148,6 +157,7 @@ WEIGHTS: dict[str, Weight] = {
     "brushed": brushed,
     "mottled": mottled,
     "streaks": streaks,
+    "weave": weave,
 }
 """Patterns that need the point alone; "dotted" needs the surface too (`Dots`)."""
 
