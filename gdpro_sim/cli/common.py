@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="gdpro",
-    help="Physically simulatable Gaussian assets: import a mesh, drop it, re-splat it, open it as USD.",
+    help="Physically simulatable Gaussian assets from a prompt, a mesh or photos: simulated, re-splatted.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -47,6 +47,11 @@ Color = Annotated[str | None, typer.Option("--color", help="Colour of the mesh: 
 
 _PHASE_NAMES = {
     "prepare": "Preparing assets",
+    "prior": "Prior: coarse mesh",
+    "surfels": "Stage 1: surfels",
+    "extraction": "Extraction: mesh",
+    "refinement": "Stage 2: bound Gaussians",
+    "output": "Asset",
     "simulate": "Simulating",
     "usd": "Writing USD",
     "video": "Writing video",

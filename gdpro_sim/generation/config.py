@@ -350,7 +350,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "tv": 10.0,
             "scale": 1.0,
         },
-        "prior": {"resolution": 64},
+        "prior": {"resolution": 128},
         "guidance": {"resolution": 384},
     },
 }

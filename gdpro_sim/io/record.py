@@ -29,6 +29,7 @@ from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import OutputError, RequestError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
+from gdpro_sim.io.generated import with_generated
 from gdpro_sim.io.images import (
     frame_name,
     read_png,
@@ -96,8 +97,14 @@ def record(
     finished frames stay on disk and the next call continues after them.
     """
     checked = scene if isinstance(scene, Scene) else load_scene(scene)
-    check_files(checked)
     device = resolve_device(device)
+    report = on_progress or (lambda phase, done, total: None)
+    begin = time.perf_counter()
+    seconds: dict[str, float] = {}
+    if any(body.prompt is not None for body in checked.bodies):
+        checked = with_generated(checked, output, device=device, on_progress=report)
+        seconds["generate"] = time.perf_counter() - begin
+    check_files(checked)
     names = [body.name for body in checked.bodies]
     file_names = ["asset.usdc" if len(names) == 1 else f"asset_{name}.usdc" for name in names]
     asset_paths = [Path(output) / file for file in file_names]
@@ -107,8 +114,6 @@ def record(
     remove_stale(folder)
     remove_stale(frames)
     store = _Store(folder / ".resume", _fingerprint(checked, device), fresh)
-    report = on_progress or (lambda phase, done, total: None)
-    seconds: dict[str, float] = {}
 
     begin = time.perf_counter()
     report("prepare", 0, 0)
