@@ -154,7 +154,8 @@ def run_stage(stage: Stage, store: Store, observer: Observer, every: int) -> Non
             stage.load_state_dict(state)
         except (KeyError, ValueError, RuntimeError) as error:
             raise GuidanceError(
-                f"the checkpoint of {stage.name} does not fit this run ({error}); start it anew in an empty folder"
+                f"the checkpoint of {stage.name} does not fit this run ({error}); "
+                "start anew in an empty folder"
             ) from error
     while stage.iteration < stage.iterations:
         observer.stepped(stage, stage.step())
