@@ -225,6 +225,23 @@ def draw_centres(
         normal_out[i] = sample.normal
 
 
+@wp.func
+def differs(
+    i: int,
+    j: int,
+    k: int,
+    tolerance: float,
+    bend: float,
+    rgb: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    depth: wp.array[float],
+) -> bool:
+    """Pixel i differs from j or k on either side of it, or z bends between the three."""
+    apart = wp.max(wp.max(wp.abs(rgb[j] - rgb[i])), wp.max(wp.abs(rgb[k] - rgb[i])))
+    apart = wp.max(apart, wp.max(wp.abs(alpha[j] - alpha[i]), wp.abs(alpha[k] - alpha[i])))
+    return apart > tolerance or wp.abs(depth[j] + depth[k] - 2.0 * depth[i]) > bend
+
+
 @wp.kernel
 def refine_edges(
     start: int,
@@ -237,7 +254,7 @@ def refine_edges(
     height: int,
     rays: int,
     tolerance: float,
-    depth_tolerance: float,
+    bend: float,
     rgb: wp.array[wp.vec3],
     alpha: wp.array[float],
     depth: wp.array[float],
@@ -247,25 +264,20 @@ def refine_edges(
     depth_out: wp.array[float],
     normal_out: wp.array[wp.vec3],
 ):
-    """The mean of rays x rays rays where a pixel's centre differs from one of its eight neighbours.
+    """The mean of rays x rays rays where a pixel's centre differs from one of its four neighbours.
 
-    Differing: a colour or opacity by more than `tolerance`, z by more than `depth_tolerance`. Other pixels
-    keep what is there.
+    Differing: a colour or opacity by more than `tolerance`, z by more than `bend` off the line through both
+    sides (times two). Other pixels keep what is there. At the picture's rim the pixel is its own neighbour.
     """
     i = start + wp.tid()
     row = (i // width) % height
     column = i % width
-    edge = bool(False)
-    for k in range(9):
-        r = row + k // 3 - 1
-        c = column + k % 3 - 1
-        if r >= 0 and r < height and c >= 0 and c < width:
-            j = i + (r - row) * width + (c - column)
-            apart = wp.max(wp.abs(rgb[j] - rgb[i]))
-            apart = wp.max(apart, wp.abs(alpha[j] - alpha[i]))
-            if apart > tolerance or wp.abs(depth[j] - depth[i]) > depth_tolerance:
-                edge = True
-    if not edge:
+    left = i - wp.min(column, 1)
+    right = i + wp.min(width - 1 - column, 1)
+    up = i - wp.min(row, 1) * width
+    down = i + wp.min(height - 1 - row, 1) * width
+    across = differs(i, left, right, tolerance, bend, rgb, alpha, depth)
+    if not across and not differs(i, up, down, tolerance, bend, rgb, alpha, depth):
         return
     view = view_of(i // (width * height), eyes, rotations, inverse_ks)
     patch = wp.abs(view.inverse_k[0, 0] * view.inverse_k[1, 1]) / float(rays * rays)

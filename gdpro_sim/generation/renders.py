@@ -30,8 +30,8 @@ FLOOR = 0.1
 TOLERANCE = 3.0 / 255.0
 """Neighbouring pixels whose colours and opacities differ by no more are one ray each."""
 
-DEPTH_TOLERANCE = 0.05
-"""The same for depth, in the unit frame."""
+BEND = 0.06
+"""The same for depth, in the unit frame: twice how far it may lie off the line through its neighbours'."""
 
 SMOOTH = 0.8
 """Cosine between a face's and a vertex's normal above which the edge between them is drawn round."""
@@ -103,7 +103,7 @@ class MeshRenderer:
         """Pictures from C cameras.
 
         A pixel is the mean of `rays` x `rays` rays where its centre differs from a neighbour's by more than
-        `TOLERANCE` in colour or opacity or `DEPTH_TOLERANCE` in depth; else its centre.
+        `TOLERANCE` in colour or opacity, or by `BEND` in depth; else its centre.
         """
         count, width, height = len(cameras), cameras.width, cameras.height
         on = torch.device(self.device)
@@ -129,7 +129,7 @@ class MeshRenderer:
             centres = _flat(rgb.clone(), alphas.clone(), depths.clone())[:3]
             launch(
                 raycast.refine_edges,
-                inputs=[*inputs, TOLERANCE, DEPTH_TOLERANCE, *centres],
+                inputs=[*inputs, TOLERANCE, BEND, *centres],
                 outputs=outputs,
             )
         if normals is not None:
