@@ -21,6 +21,7 @@ _PUBLIC = {
     "RasterOptions": "gdpro_sim.splatting",
     "Simulation": "gdpro_sim.simulation.run",
     "Scene": "gdpro_sim.simulation.scene",
+    "generate": "gdpro_sim.io.generate",
     "import_mesh": "gdpro_sim.asset",
     "load_scene": "gdpro_sim.simulation.scene",
     "rasterization": "gdpro_sim.splatting",
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from gdpro_sim.cameras import Cameras
     from gdpro_sim.errors import GdproError
     from gdpro_sim.gaussians import Gaussians
+    from gdpro_sim.io.generate import generate
     from gdpro_sim.io.record import record
     from gdpro_sim.materials import Material
     from gdpro_sim.simulation.frame import Frame
@@ -66,6 +68,7 @@ __all__ = [
     "RasterOptions",
     "Scene",
     "Simulation",
+    "generate",
     "import_mesh",
     "load_scene",
     "rasterization",

@@ -59,7 +59,7 @@ def turntable(shown: SurfaceMesh | Gaussians | BoundGaussians, views: int, size:
         low, high = shown.vertices.amin(0).cpu().numpy(), shown.vertices.amax(0).cpu().numpy()
     else:
         gaussians = shown
-        solid = gaussians.means[gaussians.opacities > 0.2]
+        solid = gaussians.means[gaussians.opacities >= 0.3 * gaussians.opacities.max()]
         ends = torch.tensor([0.01, 0.99], device=solid.device)
         low, high = torch.quantile(solid[:100_000], ends, dim=0).cpu().numpy()
     cameras = turntable_cameras(low, high, views, {**VIEW, "width": size, "height": size})
