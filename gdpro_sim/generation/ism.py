@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
@@ -78,8 +79,8 @@ class ScoreDistillation:
         if _uniform(generator) < config.flip_probability and not self.guidance.uses_cameras:
             images = images.flip(2)
         x0 = self.guidance.encode(images, views)
-        warm = _warmth(iteration, config.warmup)
-        t = int(_uniform(generator) * (self.t_end(iteration) - config.t_min)) + config.t_min
+        end, interval = schedules(config, iteration)
+        t = config.t_min + int(_uniform(generator) * (end - config.t_min))
         noise = self.noise(x0, generator)
         with torch.no_grad():
             if config.method == "sds":
@@ -87,7 +88,7 @@ class ScoreDistillation:
                 x_t = add_noise(x0, noise, t, self.schedule)
                 reference = noise
             else:
-                s = max(t - int(config.interval + config.interval_warmup * warm), 0)
+                s = max(t - interval, 0)
                 x_s = self.invert(x0, noise, s, views)
                 reference = self.guidance.noise_prediction(x_s, s, "empty", views)
                 x_t = ddim_move(x_s, reference, s, t, self.schedule)
@@ -109,11 +110,6 @@ class ScoreDistillation:
         result = self.gradient(images, views, iteration, generator)
         return _Pull.apply(result.x0, result.gradient), result
 
-    def t_end(self, iteration: int) -> int:
-        """The smallest t that is not drawn: t_max + t_warmup omega, at most 1000."""
-        config = self.config
-        return min(int(config.t_max + config.t_warmup * _warmth(iteration, config.warmup)), 1000)
-
     def noise(self, x0: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Noise of x_0's shape [B, h, w, c]: N(0, 1) plus a part that a channel of all pictures shares."""
         with beside_torch(x0):
@@ -121,17 +117,9 @@ class ScoreDistillation:
             shared = torch.randn(x0.shape[-1], generator=generator, device=generator.device)
             return (own + self.config.shared_noise * shared).to(x0.device)
 
-    def inversion_steps(self, s: int) -> list[int]:
-        """Steps 1, stride, 2 stride, ... s that the inversion visits.
-
-        That is max(1, ceil(s / stride)) moves (for stride 1, one less).
-        """
-        stride = self.config.inversion_stride
-        return [1, *(t for t in range(stride, s, stride) if t > 1), s]
-
     def invert(self, x0: torch.Tensor, noise: torch.Tensor, s: int, views: ViewBatch) -> torch.Tensor:
         """x_s: x_0 noised at t = 1, taken upward by DDIM with the predictions for the empty prompt."""
-        steps = self.inversion_steps(s)
+        steps = inversion_steps(s, self.config.inversion_stride)
         x = add_noise(x0, noise, steps[0], self.schedule)
         for t, to in pairwise(steps):
             predicted = self.guidance.noise_prediction(x, t, "empty", views)
@@ -160,9 +148,34 @@ class ScoreDistillation:
         )
 
 
-def _warmth(iteration: int, warmup: int) -> float:
-    """omega: 1 at the first iteration, 0 from `warmup` on."""
-    return max(1.0 - iteration / warmup, 0.0) if warmup else 0.0
+def schedules(config: ScoreConfig, iteration: int) -> tuple[int, int]:
+    """What t is drawn below, at most 1000, and the interval t - s, once `iteration` iterations are done.
+
+    With omega = max(1 - iteration / warmup, 0): t_max + t_warmup omega and interval + interval_warmup omega.
+    """
+    omega = max(1.0 - iteration / config.warmup, 0.0) if config.warmup else 0.0
+    end = min(int(config.t_max + config.t_warmup * omega), 1000)
+    return end, int(config.interval + config.interval_warmup * omega)
+
+
+def inversion_steps(s: int, stride: int) -> list[int]:
+    """Steps 1, stride, 2 stride, ... s that the inversion visits.
+
+    That is max(1, ceil(s / stride)) moves (for stride 1, one less).
+    """
+    return [1, *(t for t in range(stride, s, stride) if t > 1), s]
+
+
+def mean_evaluations(config: ScoreConfig, iterations: int) -> float:
+    """Evaluations of the denoiser that an iteration asks for each picture, averaged over a run."""
+    if config.method == "sds":
+        return 2.0
+    total = 0.0
+    for iteration in range(max(iterations, 1)):
+        end, interval = schedules(config, iteration)
+        s = np.maximum(np.arange(config.t_min, end) - interval, 0)
+        total += float(np.maximum(np.ceil(s / config.inversion_stride), 1.0).mean()) + 3.0
+    return total / max(iterations, 1)
 
 
 def _uniform(generator: torch.Generator) -> float:
@@ -186,4 +199,4 @@ class _Pull(torch.autograd.Function):
         return (gradients[0] * gradient).to(ctx.dtype), None
 
 
-__all__ = ["ScoreDistillation", "ScoreResult"]
+__all__ = ["ScoreDistillation", "ScoreResult", "inversion_steps", "mean_evaluations", "schedules"]

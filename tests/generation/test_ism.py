@@ -13,7 +13,7 @@ from gdpro_sim.cameras import Cameras
 from gdpro_sim.errors import GuidanceError
 from gdpro_sim.generation import diffusion
 from gdpro_sim.generation.config import ScoreConfig
-from gdpro_sim.generation.ism import ScoreDistillation
+from gdpro_sim.generation.ism import ScoreDistillation, inversion_steps, mean_evaluations, schedules
 from gdpro_sim.generation.protocols import Condition, ViewBatch, step_generator
 from tests.conditions import needs_gpu
 from tests.reference import diffusion as oracle
@@ -231,22 +231,23 @@ def test_elementwise_parts_on_long_and_half_precision_numbers() -> None:
 def test_steps_of_the_inversion() -> None:
     guidance = Analytic(oracle.flat, oracle.flat, oracle.flat)
     score = ScoreDistillation(guidance, ScoreConfig())
-    assert score.inversion_steps(420) == [1, 200, 400, 420]
-    assert score.inversion_steps(400) == [1, 200, 400]
-    assert score.inversion_steps(0) == [1, 0]
+    assert inversion_steps(420, 200) == [1, 200, 400, 420]
+    assert inversion_steps(400, 200) == [1, 200, 400]
+    assert inversion_steps(0, 200) == [1, 0]
     for s in (0, 1, 2, 199, 200, 201, 899):
         guidance.asked.clear()
         x = torch.zeros(SHAPE)
         score.invert(x, x, s, looking())
         assert len(guidance.asked) == max(1, math.ceil(s / 200))
         assert all(condition == "empty" for condition, _ in guidance.asked)
-    assert ScoreDistillation(guidance, ScoreConfig(inversion_stride=1)).inversion_steps(4) == [1, 2, 3, 4]
+    assert inversion_steps(4, 1) == [1, 2, 3, 4]
 
 
 def test_schedules_over_the_iterations() -> None:
     guidance = Analytic(oracle.flat, oracle.flat, oracle.flat)
     score = ScoreDistillation(guidance, ScoreConfig())
-    assert [score.t_end(i) for i in (0, 500, 1000, 5000)] == [980, 740, 500, 500]
+    expected = [(980, 100), (740, 90), (500, 80), (500, 80)]
+    assert [schedules(score.config, i) for i in (0, 500, 1000, 5000)] == expected
     images = torch.zeros(SHAPE)
 
     def drawn(iteration: int) -> list[tuple[int, int]]:
@@ -262,8 +263,12 @@ def test_schedules_over_the_iterations() -> None:
     guidance.asked.clear()
     result = score.gradient(images, looking(), 0, torch.Generator().manual_seed(3))
     assert len(guidance.asked) == max(1, math.ceil(result.s / 200)) + 3
-    no_warmup = ScoreDistillation(guidance, ScoreConfig(warmup=0))
-    assert no_warmup.t_end(0) == 500
+    assert schedules(ScoreConfig(warmup=0), 0) == (500, 80)
+    drawn_evaluations = [max(1, math.ceil(s / 200)) + 3 for _, s in late]
+    mean = mean_evaluations(ScoreConfig(warmup=0), 10)
+    assert mean == pytest.approx(np.mean(drawn_evaluations), abs=0.15)
+    assert mean_evaluations(ScoreConfig(), 1000) > mean
+    assert mean_evaluations(ScoreConfig(method="sds"), 10) == 2.0
 
 
 def test_noise_has_a_part_each_channel_shares() -> None:
