@@ -10,6 +10,8 @@ from gdpro_sim.generation.objects import (  # noqa: F401  (each fills NOUNS)
     nouns_buildings,
     nouns_food,
     nouns_furniture,
+    nouns_meals,
+    nouns_nature,
     nouns_toys,
     nouns_vehicles,
     nouns_vessels,

@@ -75,9 +75,9 @@ def _inherited(role: Role, style: Style, two_colored: bool) -> Style:
     if role == "main":
         takes_both = style.pattern is not None or not two_colored
         return replace(style, colors=style.colors if takes_both else style.colors[:1])
-    if role == "accent":
-        second = style.colors[1:] if style.pattern is None and len(style.colors) > 1 else ()
-        return Style(second, style.material, None)
+    if role in ("accent", "trim"):
+        second = style.colors[1:] if style.pattern is None else ()
+        return Style(second, style.material if role == "accent" else None, None)
     return Style()
 
 
@@ -239,6 +239,16 @@ class ParametricObject:
                 out[rows[paint.shape.distance(there) < 0]] = np.asarray(paint.color, np.float32)
         return out
 
+    def _normals(self, field: Field, p: np.ndarray) -> np.ndarray:
+        """Unit gradients [3, N] of `field` at p, by central differences over a hundredth of the object."""
+        step = np.float32(0.01 * (self.probe.max(0) - self.probe.min(0)).max())
+        out = np.empty_like(p)
+        for axis in range(3):
+            shift = np.zeros((3, 1), np.float32)
+            shift[axis] = step
+            out[axis] = field(p + shift) - field(p - shift)
+        return out / np.maximum(np.sqrt((out * out).sum(0)), np.float32(1e-12))
+
     def _patterned(self, index: int, p: np.ndarray) -> np.ndarray:
         style, q = self.looks[index], self._normal(p)
         assert style.pattern is not None
@@ -249,7 +259,8 @@ class ParametricObject:
             if style.palette is not None:
                 second = np.asarray(style.palette, np.float32)[dots.which(q) % len(style.palette)]
         else:
-            weight = WEIGHTS[style.pattern](q, self.seed)[:, None]
+            normals = self._normals(self.parts[index].shape.distance, p)
+            weight = WEIGHTS[style.pattern](q, normals, self.seed)[:, None]
         return base + (second - base) * weight.astype(np.float32)
 
 
@@ -294,8 +305,8 @@ def build(spec: ObjectSpec, seed: int) -> ParametricObject:
     extent = np.ptp(probe.astype(np.float64), axis=0)
     across = noun.across * (w.SIZES[spec.size] if spec.size else 1.0)
     scale = across / float(extent.max())
-    two_colored = any(part.role == "accent" for part in parts) or any(
-        paint.role == "accent" for part in parts for paint in part.paints
+    two_colored = any(part.role in ("accent", "trim") for part in parts) or any(
+        paint.role in ("accent", "trim") for part in parts for paint in part.paints
     )
     looks = tuple(look(part, spec.style, spec.parts.get(part.name), two_colored) for part in parts)
     paints = tuple(tuple(_painted(paint, spec) for paint in part.paints) for part in parts)

@@ -292,7 +292,7 @@ def wine_glass(v: Variation) -> list[Part]:
         Part("bowl", hollow(outline, 0.032, 0.04), clear, "main"),
         Part("stem", stem, clear, "main"),
         Part("rim", torus(0.8 * belly - 0.014, 0.019).at(z=0.995), rgb("e6f1f2"), "main"),
-        Part("wine", wine, rgb("8e1f36"), "accent"),
+        Part("wine", wine, rgb("8e1f36"), "trim"),
     ]
 
 
@@ -399,5 +399,5 @@ def basket(v: Variation) -> list[Part]:
         Part("body", body, rgb("c0924f"), "main", "weave", rgb("94682f")),
         Part("rim", rim, rgb("9d6d33"), "main"),
         Part("handle", bail(0.45, height - 0.03, 0.4, 0.032), rgb("9d6d33"), "main"),
-        Part("cloth", cloth, rgb("c8463f"), "accent", "checkered", rgb("f6efe2")),
+        Part("cloth", cloth, rgb("c8463f"), "trim", "checkered", rgb("f6efe2")),
     ]

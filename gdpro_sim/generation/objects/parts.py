@@ -12,8 +12,9 @@ from gdpro_sim.errors import GuidanceError
 from gdpro_sim.generation.objects.sdf import Shape
 from gdpro_sim.generation.objects.words import COLORS, Color, shaded
 
-Role = Literal["main", "accent", "fixed"]
-"""Who takes a prompt's colours: main the first, accent the second, fixed neither (unless named)."""
+Role = Literal["main", "accent", "trim", "fixed"]
+"""What a part takes from the whole object's style: main the first colour, pattern and material; accent the
+second colour and the material; trim the second colour; fixed nothing. Named in the prompt, any takes all."""
 
 T = TypeVar("T")
 

@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-Weight = Callable[[np.ndarray, int], np.ndarray]
-"""Points [3, N] and a seed to the second colour's weight [N] float32."""
+Weight = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
+"""Points [3, N], unit normals [3, N] and a seed to the second colour's weight [N] float32."""
 
 
 def smoothstep(low: float, high: float, value: np.ndarray) -> np.ndarray:
@@ -58,75 +58,85 @@ def _square(phase: np.ndarray, share: float = 0.5, edge: float = 0.04) -> np.nda
     return 1.0 - smoothstep(0.5 * share - edge, 0.5 * share + edge, distance)
 
 
-def stripes(p: np.ndarray, seed: int) -> np.ndarray:
-    return _square(p[2] / np.float32(0.14) + np.float32(0.25))
+def _around(p: np.ndarray, n: np.ndarray, count: float) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates on the surface: around the axis (`count` units a turn) and along it, both of about the same
+    length; level ground takes y and x."""
+    turn = np.arctan2(p[1], p[0]) * np.float32(count / (2 * np.pi))
+    unit = np.float32(2.2 / count)
+    level = np.abs(n[2]) > 0.8
+    return np.where(level, p[1] / unit, turn), np.where(level, p[0] / unit, p[2] / unit)
 
 
-def spiral(p: np.ndarray, seed: int) -> np.ndarray:
+def stripes(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    along = np.where(np.abs(n[2]) > 0.97, p[0], p[2])
+    return _square(along / np.float32(0.14) + np.float32(0.25))
+
+
+def spiral(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    """A winding band; on level ground it follows the radius."""
     turn = np.arctan2(p[1], p[0]) / np.float32(2 * np.pi)
-    return _square(p[2] / np.float32(0.2) + turn)
+    along = np.where(np.abs(n[2]) > 0.9, np.hypot(p[0], p[1]), p[2])
+    return _square(along / np.float32(0.2) + turn)
 
 
-def checker(p: np.ndarray, seed: int) -> np.ndarray:
-    """Squares in height and angle around the axis; on flat tops, in radius and angle."""
-    turn = np.arctan2(p[1], p[0]) / np.float32(2 * np.pi) * 10.0
-    rise = p[2] / np.float32(0.125)
+def checker(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    turn, rise = _around(p, n, 16.0)
     return np.abs(_square(0.5 * turn, edge=0.02) - _square(0.5 * rise + 0.25, edge=0.02))
 
 
-def gradient(p: np.ndarray, seed: int) -> np.ndarray:
+def gradient(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     return smoothstep(-0.45, 0.45, p[2])
 
 
-def marble(p: np.ndarray, seed: int) -> np.ndarray:
+def marble(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     bent = 2.2 * fractal_noise(p * 4.0, seed) + 0.6 * fractal_noise(p * 11.0, seed + 7)
     vein = np.abs(np.sin(np.float32(np.pi) * (2.2 * p[0] + 1.7 * p[1] + 2.0 * p[2] + 2.0 * bent)))
     return 0.85 * (1.0 - smoothstep(0.0, 0.28, vein))
 
 
-def zigzag(p: np.ndarray, seed: int) -> np.ndarray:
-    turn = np.arctan2(p[1], p[0]) / np.float32(2 * np.pi) * 8.0
-    wave = 2.0 * np.abs(turn - np.round(turn))
-    return _square(p[2] / np.float32(0.16) + 0.55 * wave)
+def zigzag(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    turn, rise = _around(p, n, 14.0)
+    wave = np.abs(turn - np.round(turn))
+    return _square(rise + 1.4 * wave)
 
 
-def plaid(p: np.ndarray, seed: int) -> np.ndarray:
-    turn = np.arctan2(p[1], p[0]) / np.float32(2 * np.pi) * 8.0
-    rise = p[2] / np.float32(0.18)
+def plaid(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    turn, rise = _around(p, n, 12.0)
     wide = 0.45 * (_square(turn, 0.5) + _square(rise, 0.5))
     thin = np.maximum(_square(turn + 0.5, 0.1), _square(rise + 0.5, 0.1))
     return np.clip(wide + 0.5 * thin, 0.0, 1.0)
 
 
-def speckles(p: np.ndarray, seed: int) -> np.ndarray:
+def speckles(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     return smoothstep(0.66, 0.74, noise(p * 24.0, seed))
 
 
-def grain(p: np.ndarray, seed: int) -> np.ndarray:
+def grain(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     """Wood: rings around an axis that lies beside the object, bent by noise."""
     q = p * np.asarray([[7.0], [7.0], [1.4]], np.float32)
-    ring = np.hypot(p[0] + 0.13, p[1] - 0.21) * 16.0 + 1.6 * fractal_noise(q, seed, 2)
+    ring = np.hypot(p[0] + 0.55, p[1] - 0.75) * 16.0 + 1.6 * fractal_noise(q, seed, 2)
     return 0.85 * (0.5 + 0.5 * np.sin(np.float32(2 * np.pi) * ring)) ** 2
 
 
-def bricks(p: np.ndarray, seed: int) -> np.ndarray:
-    """Mortar between courses; bricks run along x + y, which follows walls of either direction."""
+def bricks(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    """Mortar between courses of bricks, along whichever of x and y the wall runs."""
     row = p[2] / np.float32(0.055)
-    along = (p[0] + p[1]) / np.float32(0.14) + 0.5 * np.mod(np.floor(row), 2.0)
+    along = np.where(np.abs(n[0]) > np.abs(n[1]), p[1], p[0])
+    along = along / np.float32(0.14) + 0.5 * np.mod(np.floor(row), 2.0)
     return np.maximum(_square(row, 0.2, 0.05), _square(along, 0.08, 0.02))
 
 
-def brushed(p: np.ndarray, seed: int) -> np.ndarray:
+def brushed(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     """Faint streaks, as on brushed metal."""
     return 0.5 * fractal_noise(p * np.asarray([[6.0], [6.0], [60.0]], np.float32), seed, 2)
 
 
-def mottled(p: np.ndarray, seed: int) -> np.ndarray:
+def mottled(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     """Soft blotches, as on stone, clay or moss."""
     return fractal_noise(p * 9.0, seed)
 
 
-def streaks(p: np.ndarray, seed: int) -> np.ndarray:
+def streaks(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     """Soft upright streaks around the axis, as on an apple."""
     turn = np.arctan2(p[1], p[0])
     ring = np.stack([np.cos(turn) * 7.0, np.sin(turn) * 7.0, p[2] * 2.0])
@@ -134,13 +144,38 @@ def streaks(p: np.ndarray, seed: int) -> np.ndarray:
     return smoothstep(0.45, 0.85, fractal_noise(ring.astype(np.float32), seed, 2)) * (0.35 + 0.65 * fade)
 
 
-def weave(p: np.ndarray, seed: int) -> np.ndarray:
+def weave(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
     """Wicker: over and under in alternate rows."""
     turn = np.arctan2(p[1], p[0]) / np.float32(2 * np.pi) * 22.0
     row = p[2] / np.float32(0.055)
     return _square(row, 0.2, 0.08) + 0.45 * _square(0.5 * turn + 0.5 * np.floor(row + 0.5), 0.5, 0.1) * (
         1.0 - _square(row, 0.2, 0.08)
     )
+
+
+def ribs(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    """Dark creases between lobes: where the surface turns away from the axis's direction."""
+    radius = np.maximum(np.hypot(p[0], p[1]), np.float32(1e-6))
+    across = np.abs(n[0] * p[1] - n[1] * p[0]) / radius
+    return smoothstep(0.35, 0.95, across)
+
+
+def melon(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    """Ragged dark bands from pole to pole around the X axis."""
+    turn = np.arctan2(p[1], p[2] - 0.02) / np.float32(2 * np.pi) * 9.0
+    return _square(turn + 0.35 * fractal_noise(p * 9.0, seed), 0.4, 0.08)
+
+
+def diamonds(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    """Lines crossing at a slant, as on a waffle cone or a pineapple."""
+    turn = np.arctan2(p[1], p[0]) / np.float32(2 * np.pi) * 9.0
+    rise = p[2] / np.float32(0.13)
+    return np.maximum(_square(turn + rise, 0.16, 0.07), _square(turn - rise, 0.16, 0.07))
+
+
+def flutes(p: np.ndarray, n: np.ndarray, seed: int) -> np.ndarray:
+    """Upright stripes around the axis."""
+    return _square(np.arctan2(p[1], p[0]) / np.float32(2 * np.pi) * 22.0, 0.45, 0.1)
 
 
 WEIGHTS: dict[str, Weight] = {
@@ -158,6 +193,10 @@ WEIGHTS: dict[str, Weight] = {
     "mottled": mottled,
     "streaks": streaks,
     "weave": weave,
+    "ribs": ribs,
+    "melon": melon,
+    "diamonds": diamonds,
+    "flutes": flutes,
 }
 """Patterns that need the point alone; "dotted" needs the surface too (`Dots`)."""
 

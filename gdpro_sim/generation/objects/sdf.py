@@ -327,7 +327,7 @@ def _across_axis(profile: Sequence[Point2]) -> list[Point2]:
             out += [(0.0, z), (-reach, z)]
         elif before and not after:
             out += [(-reach, z), (0.0, z)]
-        else:
+        elif not before and not after:
             out.append((0.0, z))
     return out
 

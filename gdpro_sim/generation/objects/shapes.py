@@ -121,6 +121,22 @@ def wave(count: int, phase: float) -> Field:
     return lambda p: np.sin(count * np.arctan2(p[1], p[0]) + np.float32(phase))
 
 
+def lumps(frequency: float, phase: float) -> Field:
+    """Regular soft lumps, for scoops, bark and rock."""
+    f = np.float32(frequency)
+    return lambda p: (
+        np.sin(f * p[0] + np.float32(phase))
+        * np.sin(np.float32(1.13) * f * p[1] + np.float32(2 * phase))
+        * np.sin(np.float32(0.91) * f * p[2] + np.float32(3 * phase))
+    )
+
+
+def lobes(count: int, phase: float = 0.0) -> Shape:
+    """Every other one of 2 `count` sectors around the Z axis; no distance, only a sign: for paint."""
+    field = wave(count, phase)
+    return Shape(lambda p: -field(p), (-20.0, -20.0, -20.0), (20.0, 20.0, 20.0))
+
+
 def helix(radius: float, start: float, rise: float, turns: float, per_turn: int = 14) -> list[Vec]:
     """Points of a helix around the Z axis from z = start; the rise is over all turns."""
     count = int(per_turn * turns) + 1
@@ -148,7 +164,9 @@ __all__ = [
     "helix",
     "hollow",
     "legs",
+    "lobes",
     "loop_handle",
+    "lumps",
     "side_view",
     "star",
     "wave",
