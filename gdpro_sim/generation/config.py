@@ -152,9 +152,9 @@ class SurfelConfig(_Part):
     )
     iterations: int = Field(default=350, ge=0, description="(paper: 5000)")
     batch: int = Field(default=2, ge=1, description="views an iteration (paper: 4)")
-    resolution: int = Field(default=128, ge=16, description="pixels across a rendered view (paper: 1024)")
+    resolution: int = Field(default=256, ge=16, description="pixels across a rendered view (paper: 1024)")
     supersample: int = Field(
-        default=1, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
+        default=2, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
     )
     initial: int = Field(
         default=6000, ge=16, description="surfels at the start (paper: the prior's vertices)"
@@ -168,13 +168,18 @@ class SurfelConfig(_Part):
     lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2)")
     lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
     lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    lr_last: float = Field(
+        default=0.1, gt=0.0, le=1.0, description="last over first rate of all but positions (paper: 1)"
+    )
     sh_degree: int = Field(default=0, ge=0, le=3, description="highest SH degree (paper: 3)")
     sh_every: int = Field(default=500, ge=1, description="iterations between degrees (code: 500)")
     tv: float = Field(
         default=10.0, ge=0.0, description="weight of total variation of colour and depth (paper: 10)"
     )
     normal_consistency: float = Field(
-        default=0.1, ge=0.0, description="weight, from the end of densification on (code)"
+        default=500.0,
+        ge=0.0,
+        description="weight, from the end of densification on (code: 0.1, which a summed score drowns)",
     )
     distortion: float = Field(
         default=0.0, ge=0.0, description="weight of depth distortion (2DGS: 100 to 1000; code: 0)"
@@ -220,11 +225,11 @@ class RefinementConfig(_Part):
     mode: Literal["bound", "frozen", "unbound", "textured-mesh"] = Field(
         default="bound", description="bound; others ablate"
     )
-    iterations: int = Field(default=350, ge=0, description="(paper: 5000)")
+    iterations: int = Field(default=250, ge=0, description="(paper: 5000)")
     batch: int = Field(default=2, ge=1, description="views an iteration (paper: 4)")
-    resolution: int = Field(default=192, ge=16, description="pixels across a rendered view (paper: 1024)")
+    resolution: int = Field(default=384, ge=16, description="pixels across a rendered view (paper: 1024)")
     supersample: int = Field(
-        default=1, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
+        default=2, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
     )
     per_triangle: int = Field(
         default=6, ge=1, description="Gaussians on a triangle: 1, 3, 4, 6, 10, ... (code: 55)"
@@ -238,6 +243,15 @@ class RefinementConfig(_Part):
     lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2; code: 5e-3)")
     lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
     lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    lr_last: float = Field(
+        default=0.1, gt=0.0, le=1.0, description="last over first rate of all but positions (paper: 1)"
+    )
+    smoothing: float = Field(
+        default=10.0, ge=0.0, description="lambda of vertex steps (1 + lambda L)^-1, Large Steps (paper: 0)"
+    )
+    flatness: float = Field(
+        default=0.2, gt=0.0, le=1.0, description="first scale along the normal over in-plane (paper: 1)"
+    )
     tv: float = Field(default=1.0, ge=0.0, description="weight of total variation of colour (paper: 10)")
     scale: float = Field(default=0.1, ge=0.0, description="weight of the mean scale (paper)")
     normal_consistency: float = Field(
@@ -283,11 +297,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "iterations": 120,
             "initial": 4000,
             "maximum": 8000,
-            "resolution": 96,
+            "resolution": 192,
             "densify_until": 90,
         },
         "extraction": {"resolution": 192, "triangles": 3000},
-        "refinement": {"iterations": 120, "resolution": 128},
+        "refinement": {"iterations": 120, "resolution": 256},
     },
     "default": {},
     "high": {
@@ -296,11 +310,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "iterations": 900,
             "initial": 12000,
             "maximum": 40000,
-            "resolution": 192,
+            "resolution": 384,
             "densify_until": 600,
         },
         "extraction": {"cameras": 32, "resolution": 384, "depth": 8, "triangles": 16000},
-        "refinement": {"iterations": 900, "resolution": 320},
+        "refinement": {"iterations": 700, "resolution": 640},
     },
     "paper": {
         "cameras": {
@@ -322,7 +336,9 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "lr_sh": 2.5e-4,
             "lr_scale": 5e-4,
             "lr_rotation": 5e-4,
+            "lr_last": 1.0,
             "sh_degree": 3,
+            "normal_consistency": 0.1,
             "densify_from": 100,
             "densify_until": 2500,
             "densify_every": 100,
@@ -347,6 +363,9 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "lr_sh": 2.5e-4,
             "lr_scale": 5e-4,
             "lr_rotation": 5e-4,
+            "lr_last": 1.0,
+            "smoothing": 0.0,
+            "flatness": 1.0,
             "tv": 10.0,
             "scale": 1.0,
         },
