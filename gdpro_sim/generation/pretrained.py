@@ -109,7 +109,9 @@ def quiet() -> Iterator[None]:
             logging.set_verbosity_error()
             logging.disable_progress_bar()
         stack.enter_context(warnings.catch_warnings())
-        warnings.simplefilter("ignore", FutureWarning)  # what diffusers would rather see in an old model
+        # What diffusers would rather see in an old model, and what NumPy would rather see in diffusers.
+        warnings.simplefilter("ignore", FutureWarning)
+        warnings.simplefilter("ignore", DeprecationWarning)
         yield
 
 

@@ -120,3 +120,90 @@ def deepfloyd(folder: Path) -> Path:
     )
     pipeline.save_pretrained(folder)
     return folder
+
+
+LATENT = 12
+"""Numbers in a row of the latents of `shap_e`."""
+
+RADIUS = 0.6
+"""About that of the object which `shap_e` always gives."""
+
+
+@quiet()
+def shap_e(folder: Path) -> Path:
+    """Save a Shap-E pipeline whose every latent is nearly the same object.
+
+    That is a ball of RADIUS, longer along z, red growing with x and green with y; blue stays at one half.
+    """
+    from diffusers import HeunDiscreteScheduler, PriorTransformer, ShapEPipeline
+    from diffusers.pipelines.shap_e import ShapERenderer
+    from transformers import CLIPTextModelWithProjection
+
+    torch.manual_seed(0)
+    tokenizer = clip_tokenizer()
+    hidden, inputs = 8, 93
+    prior = PriorTransformer(
+        num_attention_heads=2,
+        attention_head_dim=8,
+        num_layers=2,
+        embedding_dim=LATENT,
+        num_embeddings=hidden,
+        additional_embeddings=0,
+        time_embed_act_fn="gelu",
+        norm_in_type="layer",
+        encoder_hid_proj_type=None,
+        added_emb_type=None,
+        time_embed_dim=32,
+        embedding_proj_dim=32,
+        clip_embed_dim=2 * LATENT,
+    )
+    renderer = ShapERenderer(
+        param_names=("nerstf.mlp.0.weight",),
+        param_shapes=((hidden, inputs),),
+        d_latent=LATENT,
+        d_hidden=hidden,
+        n_hidden_layers=1,
+        insert_direction_at=None,
+    )
+    _ball(renderer, hidden, inputs)
+    pipeline = ShapEPipeline(
+        prior=prior,
+        text_encoder=CLIPTextModelWithProjection(clip_config(tokenizer)),
+        tokenizer=tokenizer,
+        scheduler=HeunDiscreteScheduler(
+            beta_schedule="exp", prediction_type="sample", use_karras_sigmas=True
+        ),
+        shap_e_renderer=renderer,
+    )
+    pipeline.save_pretrained(folder)
+    return folder
+
+
+def _ball(renderer: Any, hidden: int, inputs: int) -> None:
+    """Weights by hand: the encoded position is [x, sin(2^k x), cos(2^k x)], axes in turn."""
+    position = torch.randn(1, 3)
+    from diffusers.pipelines.shap_e.renderer import encode_position
+
+    encoded = encode_position(position)[0]
+    cosines = [int((encoded - torch.cos(position[0, axis])).abs().argmin()) for axis in range(3)]
+    first, last = torch.zeros(hidden, inputs), torch.zeros(12, hidden)
+    bias = torch.zeros(hidden)
+    first[0, cosines[0]] = first[0, cosines[1]] = 1.0
+    first[0, cosines[2]] = 0.5
+    bias[0] = 10.0  # where silu is the identity
+    for row, axis in ((1, 0), (2, 1)):
+        first[row, axis] = 1.0
+        bias[row] = 10.0
+    last[0, 0] = 1.0
+    last[3, 1], last[4, 2] = 4.0, 4.0
+    offsets = torch.zeros(12)
+    offsets[0] = -(10.0 + 2.5 - 0.5 * RADIUS**2)
+    offsets[3] = offsets[4] = -40.0
+    (projection,) = renderer.params_proj.projections.values()
+    with torch.no_grad():
+        projection.norm.weight.fill_(1e-3)
+        projection.norm.bias.zero_()
+        projection.proj.bias.copy_(first.flatten())
+        renderer.mlp.mlp[0].bias.copy_(bias)
+        renderer.mlp.mlp[1].weight.copy_(last)
+        renderer.mlp.mlp[1].bias.copy_(offsets)
