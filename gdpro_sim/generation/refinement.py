@@ -23,7 +23,7 @@ from gdpro_sim.gaussians import SH_C0, Gaussians, Surfels, rgb_to_sh, sh_to_rgb
 from gdpro_sim.generation.config import GenerationConfig
 from gdpro_sim.generation.distillation import Clock, Distillation, Shot, nested, variation
 from gdpro_sim.generation.mesh_descent import MeshDescent
-from gdpro_sim.generation.optimizer import Adam
+from gdpro_sim.generation.optimizer import Adam, falling
 from gdpro_sim.generation.protocols import Guidance, StepReport
 from gdpro_sim.generation.surfels import DARKEST
 from gdpro_sim.generation.textured import TexturedMesh
@@ -33,6 +33,10 @@ from gdpro_sim.splatting import rasterization
 
 SMOOTHING = 10.0
 """lambda of the vertices' steps, see `MeshDescent`."""
+
+FLATNESS = 0.2
+"""Scale along the normal over those in the plane at the start: a thick start fills the outline by itself, and
+the mesh stays inside."""
 
 
 class RefinementStage:
@@ -93,13 +97,13 @@ class RefinementStage:
         rates = {
             "vertices": (c.lr_vertex, c.lr_vertex_final),
             "means": (c.lr_vertex, c.lr_vertex_final),
-            "rotations": (c.lr_rotation,) * 2,
-            "quats": (c.lr_rotation,) * 2,
-            "log_scales": (c.lr_scale,) * 2,
+            "rotations": falling(c.lr_rotation),
+            "quats": falling(c.lr_rotation),
+            "log_scales": falling(c.lr_scale),
             "logits": (c.lr_opacity,) * 2,
-            "dc": (c.lr_color,) * 2,
-            "rest": (c.lr_sh,) * 2,
-            "colors": (SH_C0 * c.lr_color,) * 2,
+            "dc": falling(c.lr_color),
+            "rest": falling(c.lr_sh),
+            "colors": falling(SH_C0 * c.lr_color),
         }
         self._adam = Adam(leaves, {name: rates[name] for name in leaves})
 
@@ -289,8 +293,8 @@ class RefinementStage:
 def bound_start(mesh: SurfaceMesh, per_triangle: int, opacity: float, sh_degree: int = 0) -> BoundGaussians:
     """`per_triangle` Gaussians on every face, in its colours: where stage 2 starts.
 
-    Barycentric weights of `barycentric_table`; each scale the face's shortest edge times
-    sqrt(3) / (3 sqrt(N)). Raises MeshError for a count without a table.
+    Barycentric weights of `barycentric_table`; scales in the plane the face's shortest edge times
+    sqrt(3) / (3 sqrt(N)), along the normal FLATNESS times that. Raises MeshError for a count without a table.
     """
     table = barycentric_table(per_triangle)
     faces = mesh.faces
@@ -309,7 +313,7 @@ def bound_start(mesh: SurfaceMesh, per_triangle: int, opacity: float, sh_degree:
         face_ids=torch.from_numpy(face_ids),
         barycentrics=torch.from_numpy(weights),
         rotations=torch.tensor([[1.0, 0.0]]).repeat(count, 1),
-        log_scales=torch.from_numpy(np.log(size[face_ids])).float()[:, None].repeat(1, 3),
+        log_scales=torch.from_numpy(np.log(size[face_ids, None] * [FLATNESS, 1.0, 1.0])).float(),
         opacity_logits=torch.full((count,), math.log(opacity / (1.0 - opacity))),
         sh=sh,
     )

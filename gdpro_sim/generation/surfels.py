@@ -21,14 +21,14 @@ from gdpro_sim.gaussians import Gaussians, Surfels, rgb_to_sh
 from gdpro_sim.generation.config import GenerationConfig
 from gdpro_sim.generation.densification import Densification
 from gdpro_sim.generation.distillation import Clock, Distillation, Shot, nested, variation
-from gdpro_sim.generation.optimizer import Adam
+from gdpro_sim.generation.optimizer import Adam, falling
 from gdpro_sim.generation.protocols import Guidance, StepReport, step_generator
 from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.repair import face_areas
 from gdpro_sim.meshing.surface import SurfaceMesh
 from gdpro_sim.splatting import losses, rasterization, rasterization_2dgs
 
-CANDIDATES, ROUNDS = 8, 4
+CANDIDATES, ROUNDS = 10, 2
 """Points drawn for each that is wanted, and rounds of moving the wanted ones apart."""
 
 DARKEST = 1e-3
@@ -64,11 +64,11 @@ class SurfelStage:
         leaves = {k: v.to(device) for k, v in _leaves(mesh, config, start).items()}
         rates = {
             "means": (c.lr_position, c.lr_position_final),
-            "quats": (c.lr_rotation,) * 2,
-            "log_scales": (c.lr_scale,) * 2,
+            "quats": falling(c.lr_rotation),
+            "log_scales": falling(c.lr_scale),
             "logits": (c.lr_opacity,) * 2,
-            "dc": (c.lr_color,) * 2,
-            "rest": (c.lr_sh,) * 2,
+            "dc": falling(c.lr_color),
+            "rest": falling(c.lr_sh),
         }
         self._adam = Adam(leaves, {name: rates[name] for name in leaves})
         self._densification = Densification(c, len(leaves["means"]), device)
