@@ -164,7 +164,7 @@ def generate(
     if resume is not None:
         if prompt or from_mesh or from_images or from_splat or config or settings:
             raise RequestError("--resume takes no prompt, input or configuration: the run keeps its own")
-        request, folder = Request.read(resume), resume
+        request = Request.read(resume)
     else:
         if background is not None:
             check_choice("--background", background, ("white", "black"))
@@ -194,7 +194,7 @@ def generate(
             ignore_unknown=ignore_unknown,
         )
         request = Request(inputs.pinned(), load_config(quality, config, settings or (), base), seed)
-        folder = run
+    folder = run if resume is None else resume
     begin = time.perf_counter()
     with live(quiet) as report:
         result = generate_run(request, folder, device=device, accept_slow=yes, on_progress=report)

@@ -68,20 +68,23 @@ class ViewBatch:
 class Guidance(Protocol):
     """A denoiser that says how pictures should look (an epsilon-predicting diffusion model, or its like)."""
 
-    alphas_cumprod: torch.Tensor
-    """[1000], falling, on the device of the model."""
+    @property
+    def alphas_cumprod(self) -> torch.Tensor:
+        """[1000], falling, on the device of the model."""
 
-    uses_cameras: bool
-    """The prediction depends on where the camera is (then pictures must not be mirrored)."""
+    @property
+    def uses_cameras(self) -> bool:
+        """The prediction depends on where the camera is (then pictures must not be mirrored)."""
 
-    native_resolution: int | None
-    """Pixels across a picture the model was made for; None: any."""
+    @property
+    def native_resolution(self) -> int | None:
+        """Pixels across a picture the model was made for; None: any."""
 
     def views(self, proposed: ViewBatch, generator: torch.Generator) -> ViewBatch:
         """The views to render in place of `proposed`: itself, unless only some cameras are known."""
 
     def encode(self, images: torch.Tensor, views: ViewBatch) -> torch.Tensor:
-        """Pictures [B, H, W, 3] in [0, 1] as what is noised, [B, ...]; differentiable."""
+        """Pictures [B, H, W, 3] in [0, 1] as what is noised, [B, h, w, c]; differentiable."""
 
     def noise_prediction(
         self, x_t: torch.Tensor, t: int, condition: Condition, views: ViewBatch

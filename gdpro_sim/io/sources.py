@@ -15,12 +15,18 @@ from gdpro_sim.generation import objects
 from gdpro_sim.generation.config import GenerationConfig
 from gdpro_sim.generation.guidance.procedural import ProceduralGuidance
 from gdpro_sim.generation.guidance.views import MeshGuidance, PhotoGuidance, SplatGuidance
+from gdpro_sim.generation.photos import Photos
 from gdpro_sim.generation.pipeline import Source
+from gdpro_sim.generation.priors.hull import HullPrior
+from gdpro_sim.generation.priors.mesh import MeshPrior
 from gdpro_sim.generation.priors.procedural import ProceduralPrior
+from gdpro_sim.generation.priors.sphere import SpherePrior
 from gdpro_sim.generation.protocols import CoarseMesh, Guidance, Prior, UnitFrame
+from gdpro_sim.io.photos import read_photos
+from gdpro_sim.io.ply import read_ply
+from gdpro_sim.io.splat import read_splat, splat_in_unit_frame
 from gdpro_sim.meshing.load import load_mesh
 from gdpro_sim.meshing.surface import SurfaceMesh
-
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +104,7 @@ def open_source(
         path = inputs.mesh or inputs.images or inputs.splat
         raise RequestError(f"{path} has changed since the run began; start anew in another folder")
     if inputs.images is not None:
-        return _from_photos(inputs, config, device)
+        return _from_photos(inputs, config, seed, device)
     if inputs.splat is not None:
         return _from_splat(inputs, config, device)
     if inputs.mesh is not None:
@@ -110,7 +116,8 @@ def _from_prompt(
     inputs: Inputs, config: GenerationConfig, seed: int, device: str, accept_slow: bool
 ) -> Source:
     record: dict[str, Any] = {}
-    frame, guidance = None, None
+    guidance: Guidance
+    frame = None
     if config.guidance.kind == "procedural":
         spec = objects.parse(inputs.prompt, ignore_unknown=inputs.ignore_unknown)
         record["read_as"] = spec.describe()
@@ -122,7 +129,7 @@ def _from_prompt(
         raise GuidanceError(
             "guidance views needs something to look at: --from-mesh, --from-images or --from-splat"
         )
-    prior, make = _prior(inputs, config, seed, inputs.prompt)
+    prior, make = _prior(inputs, config, seed, device, frame=frame)
     record["prior"] = prior.describe()
     own = config.prior.kind in ("procedural", "sphere")
     return Source(_name(inputs.prompt), inputs.prompt, guidance, make, frame if own else None, None, record)
@@ -154,17 +161,11 @@ def _duration(seconds: float) -> str:
     return f"{seconds:.0f} seconds"
 
 
-def _name(prompt: str) -> str:
-    words = [w for w in prompt.lower().replace("_", " ").split() if w not in ("a", "an", "the")]
-    return "_".join("".join(ch for ch in w if ch.isalnum()) for w in words[:6]) or "asset"
-
-
-def _from_mesh(
-    inputs: Inputs, config: GenerationConfig, seed: int, device: str, accept_slow: bool
-) -> Source:
+def _from_mesh(inputs: Inputs, config: GenerationConfig, seed: int, device: str, accept_slow: bool) -> Source:
     path = Path(inputs.mesh or "")
     mesh = load_mesh(path, color=inputs.color, up=inputs.up, scale=inputs.scale)
     frame = UnitFrame.around(mesh.vertices)
+    guidance: Guidance
     if config.guidance.kind == "diffusers":
         guidance = _diffusion(inputs.prompt, config, device, accept_slow)
     elif config.guidance.kind == "views":
@@ -177,30 +178,69 @@ def _from_mesh(
 
 
 def _from_photos(inputs: Inputs, config: GenerationConfig, seed: int, device: str) -> Source:
-    from gdpro_sim.io.photos import read_photos
-
     path = Path(inputs.images or "")
-    photos, frame = read_photos(path, up=inputs.up, background=inputs.background)
-    guidance = PhotoGuidance(photos, config.guidance, device=device)
-    prior, make = _prior(inputs, config, seed, device, photos=photos, frame=frame)
-    record = {"prior": prior.describe(), "source": path.name, "sha256": inputs.sha256, "photos": len(photos)}
-    # photos show colours alone: no share of the iterations may ask for disparity
-    return Source(path.resolve().name, "", guidance, make, frame, None, record)
+    scene = read_photos(path, background=inputs.background, up=inputs.up)
+    guidance = PhotoGuidance(scene.photos, config.guidance, device=device)
+    frame = UnitFrame((0.0, 0.0, 0.0), 1.0)  # photos and hull are in the unit frame already
+    prior, make = _prior(inputs, config, seed, device, photos=scene.photos, frame=frame)
+    record = {
+        "prior": prior.describe(),
+        "source": path.name,
+        "sha256": inputs.sha256,
+        "photos": scene.description,
+    }
+    return Source(path.resolve().name, inputs.prompt, guidance, make, frame, None, record)
 
 
 def _from_splat(inputs: Inputs, config: GenerationConfig, device: str) -> Source:
     path = Path(inputs.splat or "")
-    cloud = read_cloud(path, up=inputs.up)
-    frame = unit_frame(cloud)
-    unit = frame.to_unit_gaussians(cloud).to(device)
-    guidance = SplatGuidance(unit, config.guidance)
-    record = {"source": path.name, "sha256": inputs.sha256, "gaussians": len(cloud)}
-    return Source(path.stem, "", guidance, None, frame, unit, record)
+    cloud = read_splat(path) if path.suffix.lower() == ".splat" else read_ply(path)
+    unit, frame = splat_in_unit_frame(cloud, up=inputs.up)
+    guidance = SplatGuidance(unit.to(device), config.guidance)
+    record = {"source": path.name, "sha256": inputs.sha256, "gaussians": len(cloud), "kept": len(unit)}
+    return Source(path.stem, inputs.prompt, guidance, None, frame, unit.to(device), record)
 
 
 def _prior(
-    inputs: Inputs, config: GenerationConfig, seed: int, prompt: str
+    inputs: Inputs,
+    config: GenerationConfig,
+    seed: int,
+    device: str,
+    *,
+    mesh: SurfaceMesh | None = None,
+    photos: Photos | None = None,
+    frame: UnitFrame | None = None,
 ) -> tuple[Prior, Callable[[], CoarseMesh]]:
     """The prior that `config` names, and a call that runs it."""
-    prior = ProceduralPrior(config.prior, ignore_unknown=inputs.ignore_unknown)
-    return prior, lambda: prior.mesh(config.prior.prompt or prompt, seed)
+    settings = config.prior
+    prior: Prior
+    if settings.kind == "procedural":
+        prior = ProceduralPrior(settings, ignore_unknown=inputs.ignore_unknown)
+    elif settings.kind == "sphere":
+        prior = SpherePrior(frame) if frame is not None else SpherePrior()
+    elif settings.kind == "shap-e":
+        from gdpro_sim.generation.priors.shap_e import ShapEPrior
+
+        prior = ShapEPrior(settings, device=device)
+    elif settings.kind == "hull":
+        if photos is None:
+            raise GuidanceError("prior hull is carved from photos: it goes with --from-images")
+        prior = HullPrior(photos)
+    elif settings.file is not None:
+        prior = MeshPrior(load_mesh(settings.file, color=inputs.color, up=inputs.up, scale=inputs.scale))
+    elif mesh is not None:
+        prior = MeshPrior(mesh)
+    else:
+        raise GuidanceError("prior mesh needs a file: --prior mesh --prior-model FILE, or --from-mesh FILE")
+    prompt = settings.prompt or inputs.prompt
+    if settings.kind in ("procedural", "shap-e") and not prompt.strip():
+        raise GuidanceError(f"prior {settings.kind} needs words: give a prompt, or --prior-prompt")
+    return prior, lambda: prior.mesh(prompt, seed)
+
+
+def _name(prompt: str) -> str:
+    words = [w for w in prompt.lower().replace("_", " ").split() if w not in ("a", "an", "the")]
+    return "_".join("".join(ch for ch in w if ch.isalnum()) for w in words[:6]) or "asset"
+
+
+__all__ = ["Inputs", "open_source"]
