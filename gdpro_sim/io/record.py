@@ -29,7 +29,6 @@ from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import OutputError, RequestError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
-from gdpro_sim.io.generated import with_generated
 from gdpro_sim.io.images import (
     frame_name,
     read_png,
@@ -102,6 +101,8 @@ def record(
     begin = time.perf_counter()
     seconds: dict[str, float] = {}
     if any(body.prompt is not None for body in checked.bodies):
+        from gdpro_sim.io.generated import with_generated
+
         checked = with_generated(checked, output, device=device, on_progress=report)
         seconds["generate"] = time.perf_counter() - begin
     check_files(checked)

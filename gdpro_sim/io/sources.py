@@ -22,9 +22,6 @@ from gdpro_sim.generation.priors.mesh import MeshPrior
 from gdpro_sim.generation.priors.procedural import ProceduralPrior
 from gdpro_sim.generation.priors.sphere import SpherePrior
 from gdpro_sim.generation.protocols import CoarseMesh, Guidance, Prior, UnitFrame
-from gdpro_sim.io.photos import read_photos
-from gdpro_sim.io.ply import read_ply
-from gdpro_sim.io.splat import read_splat, splat_in_unit_frame
 from gdpro_sim.meshing.load import load_mesh
 from gdpro_sim.meshing.surface import SurfaceMesh
 
@@ -178,6 +175,8 @@ def _from_mesh(inputs: Inputs, config: GenerationConfig, seed: int, device: str,
 
 
 def _from_photos(inputs: Inputs, config: GenerationConfig, seed: int, device: str) -> Source:
+    from gdpro_sim.io.photos import read_photos
+
     path = Path(inputs.images or "")
     scene = read_photos(path, background=inputs.background, up=inputs.up)
     guidance = PhotoGuidance(scene.photos, config.guidance, device=device)
@@ -193,6 +192,9 @@ def _from_photos(inputs: Inputs, config: GenerationConfig, seed: int, device: st
 
 
 def _from_splat(inputs: Inputs, config: GenerationConfig, device: str) -> Source:
+    from gdpro_sim.io.ply import read_ply
+    from gdpro_sim.io.splat import read_splat, splat_in_unit_frame
+
     path = Path(inputs.splat or "")
     cloud = read_splat(path) if path.suffix.lower() == ".splat" else read_ply(path)
     unit, frame = splat_in_unit_frame(cloud, up=inputs.up)
