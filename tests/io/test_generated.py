@@ -11,7 +11,7 @@ from gdpro_sim.errors import SceneError
 from gdpro_sim.generation.config import GenerationConfig, load_config
 from gdpro_sim.io import generated
 from gdpro_sim.io.record import record
-from gdpro_sim.simulation.run import Simulation
+from gdpro_sim.simulation.run import simulate
 from gdpro_sim.simulation.scene import check_scene, drop_scene, load_scene
 from tests.generation.test_pipeline import SMALL
 
@@ -54,7 +54,7 @@ def test_a_prompt_is_generated_once_and_simulated(tmp_path: Path) -> None:
 
 def test_plain_simulation_says_what_to_do_with_a_prompt() -> None:
     with pytest.raises(SceneError, match="generate it first"):
-        Simulation(check_scene(SCENE))
+        next(iter(simulate(check_scene(SCENE))))
 
 
 @pytest.mark.parametrize(
