@@ -10,14 +10,6 @@ BETAS = (0.9, 0.999)
 EPSILON = 1e-15
 """3D Gaussian Splatting's: gradients of a Gaussian that covers little are small, and count as much."""
 
-CALM = 0.1
-"""Last learning rate over the first, where only one is given: the score is noisy."""
-
-
-def falling(rate: float) -> tuple[float, float]:
-    """Learning rates of the first and the last step."""
-    return rate, CALM * rate
-
 
 class Adam:
     """Kingma and Ba, "Adam" (arXiv 1412.6980), algorithm 1, over leaf tensors by name.
@@ -107,4 +99,4 @@ class Adam:
         self._first[name], self._second[name] = first, second
 
 
-__all__ = ["BETAS", "CALM", "EPSILON", "Adam", "falling"]
+__all__ = ["BETAS", "EPSILON", "Adam"]

@@ -20,23 +20,16 @@ from gdpro_sim.cameras import Cameras
 from gdpro_sim.device import beside_torch
 from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.gaussians import SH_C0, Gaussians, Surfels, rgb_to_sh, sh_to_rgb
-from gdpro_sim.generation.config import GenerationConfig
+from gdpro_sim.generation.config import GenerationConfig, RefinementConfig
 from gdpro_sim.generation.distillation import Clock, Distillation, Shot, nested, variation
 from gdpro_sim.generation.mesh_descent import MeshDescent
-from gdpro_sim.generation.optimizer import Adam, falling
+from gdpro_sim.generation.optimizer import Adam
 from gdpro_sim.generation.protocols import Guidance, StepReport
 from gdpro_sim.generation.surfels import DARKEST
 from gdpro_sim.generation.textured import TexturedMesh
 from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.surface import MeshMaterial, SurfaceMesh
 from gdpro_sim.splatting import rasterization
-
-SMOOTHING = 10.0
-"""lambda of the vertices' steps, see `MeshDescent`."""
-
-FLATNESS = 0.2
-"""Scale along the normal over those in the plane at the start: a thick start fills the outline by itself, and
-the mesh stays inside."""
 
 
 class RefinementStage:
@@ -88,22 +81,22 @@ class RefinementStage:
             background="mixed",
         )
         device = self._distillation.device
-        self._start = bound_start(mesh, c.per_triangle, c.initial_opacity, c.sh_degree).to(device)
+        self._start = bound_start(mesh, c).to(device)
         b = self._start
-        self._descent = MeshDescent(b.faces, len(b.vertices), SMOOTHING if c.mode == "bound" else 0.0)
+        self._descent = MeshDescent(b.faces, len(b.vertices), c.smoothing if c.mode == "bound" else 0.0)
         self._binding = TriangleBinding(b.faces, b.face_ids, b.barycentrics, len(b.vertices))
         self._textured = TexturedMesh(mesh, device) if textured else None
         leaves = self._leaves(start)
         rates = {
             "vertices": (c.lr_vertex, c.lr_vertex_final),
             "means": (c.lr_vertex, c.lr_vertex_final),
-            "rotations": falling(c.lr_rotation),
-            "quats": falling(c.lr_rotation),
-            "log_scales": falling(c.lr_scale),
-            "logits": (c.lr_opacity,) * 2,
-            "dc": falling(c.lr_color),
-            "rest": falling(c.lr_sh),
-            "colors": falling(SH_C0 * c.lr_color),
+            "rotations": (c.lr_rotation, c.lr_rotation * c.lr_last),
+            "quats": (c.lr_rotation, c.lr_rotation * c.lr_last),
+            "log_scales": (c.lr_scale, c.lr_scale * c.lr_last),
+            "logits": (c.lr_opacity,) * 2,  # has far to go, and saturates
+            "dc": (c.lr_color, c.lr_color * c.lr_last),
+            "rest": (c.lr_sh, c.lr_sh * c.lr_last),
+            "colors": (SH_C0 * c.lr_color, SH_C0 * c.lr_color * c.lr_last),
         }
         self._adam = Adam(leaves, {name: rates[name] for name in leaves})
 
@@ -290,12 +283,14 @@ class RefinementStage:
         return Shot(cameras, image[..., :3], image[..., 3:], alphas), cost, len(means)
 
 
-def bound_start(mesh: SurfaceMesh, per_triangle: int, opacity: float, sh_degree: int = 0) -> BoundGaussians:
-    """`per_triangle` Gaussians on every face, in its colours: where stage 2 starts.
+def bound_start(mesh: SurfaceMesh, config: RefinementConfig) -> BoundGaussians:
+    """`config.per_triangle` Gaussians on every face, in its colours: where stage 2 starts.
 
     Barycentric weights of `barycentric_table`; scales in the plane the face's shortest edge times
-    sqrt(3) / (3 sqrt(N)), along the normal FLATNESS times that. Raises MeshError for a count without a table.
+    sqrt(3) / (3 sqrt(N)), along the normal `config.flatness` times that: a thick start fills the outline by
+    itself, and the mesh stays inside. Raises MeshError for a count without a table.
     """
+    per_triangle, opacity = config.per_triangle, config.initial_opacity
     table = barycentric_table(per_triangle)
     faces = mesh.faces
     face_ids = np.repeat(np.arange(len(faces), dtype=np.int32), per_triangle)
@@ -305,7 +300,7 @@ def bound_start(mesh: SurfaceMesh, per_triangle: int, opacity: float, sh_degree:
     size = np.maximum(shortest, 1e-6) * math.sqrt(3.0) / (3.0 * math.sqrt(per_triangle))
     count = len(face_ids)
     colors = SurfaceColors(mesh).at(face_ids, weights)[:, :3].clip(DARKEST, 1.0)
-    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
+    sh = torch.zeros(count, (config.sh_degree + 1) ** 2, 3)
     sh[:, 0] = rgb_to_sh(torch.from_numpy(colors))
     return BoundGaussians(
         vertices=torch.from_numpy(mesh.vertices.copy()),
@@ -313,10 +308,10 @@ def bound_start(mesh: SurfaceMesh, per_triangle: int, opacity: float, sh_degree:
         face_ids=torch.from_numpy(face_ids),
         barycentrics=torch.from_numpy(weights),
         rotations=torch.tensor([[1.0, 0.0]]).repeat(count, 1),
-        log_scales=torch.from_numpy(np.log(size[face_ids, None] * [FLATNESS, 1.0, 1.0])).float(),
+        log_scales=torch.from_numpy(np.log(size[face_ids, None] * [config.flatness, 1.0, 1.0])).float(),
         opacity_logits=torch.full((count,), math.log(opacity / (1.0 - opacity))),
         sh=sh,
     )
 
 
-__all__ = ["SMOOTHING", "RefinementStage", "bound_start"]
+__all__ = ["RefinementStage", "bound_start"]

@@ -21,7 +21,7 @@ from gdpro_sim.gaussians import Gaussians, Surfels, rgb_to_sh
 from gdpro_sim.generation.config import GenerationConfig
 from gdpro_sim.generation.densification import Densification
 from gdpro_sim.generation.distillation import Clock, Distillation, Shot, nested, variation
-from gdpro_sim.generation.optimizer import Adam, falling
+from gdpro_sim.generation.optimizer import Adam
 from gdpro_sim.generation.protocols import Guidance, StepReport, step_generator
 from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.repair import face_areas
@@ -64,11 +64,11 @@ class SurfelStage:
         leaves = {k: v.to(device) for k, v in _leaves(mesh, config, start).items()}
         rates = {
             "means": (c.lr_position, c.lr_position_final),
-            "quats": falling(c.lr_rotation),
-            "log_scales": falling(c.lr_scale),
-            "logits": (c.lr_opacity,) * 2,
-            "dc": falling(c.lr_color),
-            "rest": falling(c.lr_sh),
+            "quats": (c.lr_rotation, c.lr_rotation * c.lr_last),
+            "log_scales": (c.lr_scale, c.lr_scale * c.lr_last),
+            "logits": (c.lr_opacity,) * 2,  # has far to go, and saturates
+            "dc": (c.lr_color, c.lr_color * c.lr_last),
+            "rest": (c.lr_sh, c.lr_sh * c.lr_last),
         }
         self._adam = Adam(leaves, {name: rates[name] for name in leaves})
         self._densification = Densification(c, len(leaves["means"]), device)

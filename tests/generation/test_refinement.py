@@ -10,8 +10,9 @@ import torch
 
 from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.gaussians import Surfels, sh_to_rgb
+from gdpro_sim.generation.config import RefinementConfig
 from gdpro_sim.generation.guidance.views import MeshGuidance
-from gdpro_sim.generation.refinement import FLATNESS, RefinementStage, bound_start
+from gdpro_sim.generation.refinement import RefinementStage, bound_start
 from gdpro_sim.generation.surfels import SurfelStage
 from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.repair import face_normals, validate
@@ -32,7 +33,7 @@ def stage_of(mode: str, steps: int = 0, **settings: object) -> RefinementStage:
 @pytest.mark.parametrize("count", [1, 3, 4, 6, 10])
 def test_the_start_is_the_methods(count: int) -> None:
     mesh = ball(1)
-    start = bound_start(mesh, count, 0.7)
+    start = bound_start(mesh, RefinementConfig(per_triangle=count, flatness=0.5))
     assert len(start) == count * len(mesh.faces)
     corners = torch.from_numpy(mesh.vertices)[torch.from_numpy(mesh.faces).long()]
     at = start.gaussians()
@@ -40,7 +41,7 @@ def test_the_start_is_the_methods(count: int) -> None:
     torch.testing.assert_close(centroids, corners.mean(1), atol=1e-5, rtol=0.0)
     shortest = (corners - corners[:, [1, 2, 0]]).norm(dim=2).amin(1)
     wanted = (shortest * math.sqrt(3.0) / (3.0 * math.sqrt(count))).repeat_interleave(count)
-    torch.testing.assert_close(at.scales, wanted[:, None] * torch.tensor([FLATNESS, 1.0, 1.0]))
+    torch.testing.assert_close(at.scales, wanted[:, None] * torch.tensor([0.5, 1.0, 1.0]))
     torch.testing.assert_close(at.opacities, torch.full_like(wanted, 0.7))
     shown = SurfaceColors(mesh).at(start.face_ids.numpy(), start.barycentrics.numpy())[:, :3]
     np.testing.assert_allclose(sh_to_rgb(at.sh[:, 0]).numpy(), shown, atol=1e-6)
@@ -48,7 +49,7 @@ def test_the_start_is_the_methods(count: int) -> None:
 
 def test_vertices_learn_and_gaussians_ride() -> None:
     stage = stage_of("bound", 8, lr_vertex=1e-2)
-    result, start = stage.result(), bound_start(ball(2, 0.75), 3, 0.7)
+    result, start = stage.result(), bound_start(ball(2, 0.75), RefinementConfig(per_triangle=3))
     assert float((result.vertices - start.vertices).norm(dim=1).min()) > 1e-4
     for name in ("faces", "face_ids", "barycentrics"):
         assert torch.equal(getattr(result, name), getattr(start, name)), name
@@ -61,14 +62,14 @@ def test_vertices_learn_and_gaussians_ride() -> None:
 
 def test_frozen_means_stay_and_the_rest_learns() -> None:
     stage = stage_of("frozen", 8)
-    result, start = stage.result(), bound_start(ball(2, 0.75), 3, 0.7)
+    result, start = stage.result(), bound_start(ball(2, 0.75), RefinementConfig(per_triangle=3))
     assert torch.equal(result.vertices, start.vertices)
     assert torch.equal(stage.gaussians().means, start.gaussians().means)
     assert not torch.equal(result.log_scales, start.log_scales)
 
 
 def test_unbound_starts_bound_or_where_stage_one_ended() -> None:
-    bound = bound_start(ball(2, 0.75), 3, 0.7).gaussians()
+    bound = bound_start(ball(2, 0.75), RefinementConfig(per_triangle=3)).gaussians()
     stage = stage_of("unbound")
     for name in ("means", "scales", "sh"):
         torch.testing.assert_close(getattr(stage.gaussians(), name), getattr(bound, name))
