@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gdpro_sim.asset import Asset
 from gdpro_sim.io.images import read_png
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -52,6 +53,28 @@ def test_fit_views(tmp_path: Path, kind: str) -> None:
     assert psnrs[-1] > psnrs[0] + 5.0 and angles[-1] < angles[0]
     assert read_png(tmp_path / "out/fit_views/held_out.png").shape == (4 * 32, 4 * 32, 3)
     assert (tmp_path / "out/fit_views/fit.ply").stat().st_size > 300 * 50
+
+
+@pytest.mark.slow
+def test_generate_by_stages(tmp_path: Path) -> None:
+    small = [
+        "surfels.iterations=20",
+        "surfels.resolution=96",
+        "refinement.iterations=8",
+        "refinement.resolution=96",
+    ]
+    small += ["extraction.triangles=800", "surfels.initial=1500"]
+    output = run(
+        "generate_by_stages.py",
+        "a green apple",
+        *(part for s in small for part in ("--set", s)),
+        cwd=tmp_path,
+    )
+    folder = tmp_path / "out/generate_by_stages"
+    asset = Asset.load(folder / "asset.usdc")
+    assert f"{len(asset.gaussians)} Gaussians" in output
+    for name in ("prior", "surfels", "extraction", "refinement"):
+        assert read_png(folder / f"{name}.png").std() > 10.0
 
 
 def test_every_example_is_tested() -> None:
