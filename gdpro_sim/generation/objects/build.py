@@ -19,7 +19,7 @@ from gdpro_sim.generation.objects.spec import ObjectSpec, Style
 from gdpro_sim.meshing.repair import face_components, signed_volume
 from gdpro_sim.meshing.surface import MeshMaterial, SurfaceMesh
 
-PROBE = 48
+PROBE = 72
 """Cells of the surface that an object's extent is measured on."""
 
 

@@ -32,8 +32,8 @@ def isosurface(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Surface of `field` <= 0 inside the box: vertices [V, 3] float32 and faces [F, 3] int32, outward.
 
-    cells: across the longest side of the box. The grid reaches two cells beyond the box, where the field must
-    be positive. Vertices are shared and lie on grid edges; an empty surface gives empty arrays.
+    cells: across the longest side of the box. The grid reaches two cells beyond the box and its outermost nodes
+    count as outside. Vertices are shared and lie on grid edges; an empty surface gives empty arrays.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     step = float((high - low).max()) / cells
@@ -91,7 +91,8 @@ def _node_values(
         # A node on the surface would give faces without area.
         least = np.float32(1e-3 * step)
         found = np.where(np.abs(found) < least, np.where(found < 0, -least, least), found)
-        flat[index] = found
+        rim = ((place == 0) | (place == shape[:, None])).any(0)
+        flat[index] = np.where(rim, np.maximum(found, least), found)
         inside = flat[corner] < 0
         mixed = inside.any(1) & ~inside.all(1)
         crossed.append(cells[:, mixed])

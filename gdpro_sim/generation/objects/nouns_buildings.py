@@ -275,9 +275,8 @@ def _slab(a: tuple[float, float], b: tuple[float, float], depth: float) -> Shape
     middle = (0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]))
     length = math.hypot(b[0] - a[0], b[1] - a[1])
     tilt = math.degrees(math.atan2(b[1] - a[1], b[0] - a[0]))
-    return (
-        box(depth, length + 0.1, 0.05, 0.014).at(z=-0.012).rx(tilt + 180).at(0, middle[0], middle[1] + 0.03)
-    )
+    board = box(depth, length + 0.1, 0.05, 0.014).at(z=-0.026).rx(tilt + 180)
+    return board.at(0, middle[0], middle[1] + 0.018)
 
 
 @noun("igloo", kind="buildings", across=3.2, material="snow")
