@@ -70,20 +70,24 @@ class MeshDescent:
         for ends in (i, j):
             shortest.scatter_reduce_(0, ends, lengths, "amin")
         limit = torch.where(torch.isfinite(shortest), REACH * shortest, 0.0)
-        factor = (limit / step.norm(dim=1).clamp(min=1e-30)).clamp(max=1.0)
-        after = vertices + step * factor[:, None]
-        before, roundness = face_normals(vertices, self.faces), self._roundness(vertices)
+        after = vertices + step * (limit / step.norm(dim=1).clamp(min=1e-30)).clamp(max=1.0)[:, None]
         corners = self.faces.long()
+        normals, roundness = _shapes(vertices[corners])
+        suspects = torch.arange(len(corners), device=corners.device)
         for _ in range(ROUNDS):
-            narrow = self._roundness(after)
-            turned = (before * face_normals(after, self.faces)).sum(1) < FOLD
-            bad = turned | ((narrow < NARROW) & (narrow < roundness))
+            at = corners[suspects]
+            turned, narrow = _shapes(after[at])
+            bad = (normals[suspects] * turned).sum(1) < FOLD
+            bad |= (narrow < NARROW) & (narrow < roundness[suspects])
             # A face whose corners all stay is as it was.
-            bad &= (after[corners] != vertices[corners]).flatten(1).any(1)
+            bad &= (after[at] != vertices[at]).flatten(1).any(1)
             if not bool(bad.any()):
                 return after
-            stay = corners[bad].ravel()
+            stay = at[bad].ravel()
             after[stay] = vertices[stay]
+            held = torch.zeros(self.count, dtype=torch.bool, device=corners.device)
+            held[stay] = True
+            suspects = torch.nonzero(held[corners].any(1))[:, 0]
         return vertices.clone()
 
     def normal_consistency(self, vertices: torch.Tensor) -> torch.Tensor:
@@ -100,12 +104,15 @@ class MeshDescent:
         offsets = vertices - sums / self._degrees.clamp(min=1)[:, None]
         return offsets[joined].norm(dim=1).sum() / max(1, int(joined.sum()))
 
-    def _roundness(self, vertices: torch.Tensor) -> torch.Tensor:
-        """Area over the squared longest edge of each face, [F]."""
-        corners = vertices[self.faces.long()]
-        edges = corners - corners[:, [1, 2, 0]]
-        area = 0.5 * torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1)
-        return area / edges.square().sum(2).amax(1).clamp(min=1e-30)
+
+def _shapes(corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Unit normals [F, 3] of triangles [F, 3, 3], and area over the squared longest edge [F]."""
+    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normals = torch.linalg.cross(ab, ac)
+    twice = normals.norm(dim=1)
+    squares = torch.stack([ab.square().sum(1), ac.square().sum(1), (ac - ab).square().sum(1)])
+    longest = squares.amax(0).clamp(min=1e-30)
+    return normals / twice.clamp(min=1e-30)[:, None], 0.5 * twice / longest
 
 
 __all__ = ["FOLD", "NARROW", "REACH", "MeshDescent"]
