@@ -19,6 +19,14 @@ LEAST = 2
 """Fewer photos tell nothing about depth."""
 
 
+def too_few(count: int) -> GuidanceError:
+    """The error for fewer photos than `LEAST`."""
+    return GuidanceError(
+        f"{count} photo{'s' * (count != 1)} with a camera; at least {LEAST} from different sides are needed "
+        "(20 to 200 work well)"
+    )
+
+
 @dataclass(frozen=True)
 class Photos:
     """N photos, each of its own size.
@@ -40,10 +48,7 @@ class Photos:
     def __post_init__(self) -> None:
         n = len(self.pictures)
         if n < LEAST:
-            raise GuidanceError(
-                f"{n} photo{'s' * (n != 1)} with a camera; at least {LEAST} from different sides are needed "
-                "(20 to 200 work well)"
-            )
+            raise too_few(n)
         if self.viewmats.shape != (n, 4, 4) or self.Ks.shape != (n, 3, 3) or len(self.names) != n:
             raise ValueError(
                 f"{n} photos need viewmats [{n}, 4, 4], Ks [{n}, 3, 3] and {n} names, got "
@@ -183,4 +188,4 @@ def _resampled(
     return torch.einsum("rh,hwc,vw->rvc", rows[1], part, columns[1]).clamp_(0.0, 1.0)
 
 
-__all__ = ["Photos"]
+__all__ = ["LEAST", "Photos", "too_few"]
