@@ -56,10 +56,13 @@ GRAZING = 0.15
 FEWEST = 200
 """Points that Poisson needs to say anything about a closed surface."""
 
-SCREENING = 4.0
-"""Weight of the points against the gradients in screened Poisson (the authors' default)."""
+SCREENING = 10.0
+"""Weight of the points against the gradients in screened Poisson (the authors take 4).
 
-THINNING = 0.7
+Measured on a mug with walls of 0.07: volume 11 % too large with 4, 7 % with 20; more lets noise through.
+"""
+
+THINNING = 1.5
 """Size of the cubes that keep one point each, in cells of Poisson's grid."""
 
 AGREEING = 0.5
@@ -131,13 +134,15 @@ def oriented_points(gaussians: Gaussians | Surfels, config: ExtractionConfig) ->
 
     Raises MeshError where nothing is opaque or too little is left.
     """
+    if not len(gaussians):
+        raise MeshError("nothing opaque is seen: there are no Gaussians")
     gather = {"rendered-depth": _depth_points, "level-set": _level_points, "centres": _centre_points}
     found = gather[config.points](gaussians, config)
     inside = np.isfinite(found.points).all(1) & np.isfinite(found.normals).all(1)
     inside &= np.linalg.norm(found.points, axis=1) < REACH
     found = found[inside]
     if not len(found):
-        strongest = float(gaussians.opacities.max()) if len(gaussians) else 0.0
+        strongest = float(gaussians.opacities.max())
         raise MeshError(
             f"nothing opaque is seen: {len(gaussians)} Gaussians, largest opacity {strongest:.2g}; "
             "optimise longer, or lower extraction.level where points are taken from the level set"
@@ -220,18 +225,20 @@ def _cell(config: ExtractionConfig) -> float:
 
 
 def _cameras(config: ExtractionConfig, size: int | None = None) -> Cameras:
-    """Cameras evenly over a sphere, the poles included; each sees the ball of radius REACH.
+    """Cameras on a spiral over a sphere, evenly in polar angle, each seeing the ball of radius REACH.
 
-    A Fibonacci lattice between the poles, from where hollow things show their bottoms.
+    So the poles get more of them than by area: it is from there that hollow things show their insides.
     """
-    k = np.arange(config.cameras)
-    z = 1.0 - 2.0 * k / (config.cameras - 1)
-    turn = math.pi * (1.0 + math.sqrt(5.0)) * k
-    flat = np.sqrt(1.0 - z**2)
-    eyes = DISTANCE * np.stack([flat * np.cos(turn), flat * np.sin(turn), z], 1)
+    polar = math.pi * np.arange(config.cameras) / (config.cameras - 1)
+    turn = math.pi * (1.0 + math.sqrt(5.0)) * np.arange(config.cameras)
+    eyes = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], 1)
     size = size or config.resolution
     return Cameras.look_at(
-        eyes, [0.0, 0.0, 0.0], vertical_fov=2.0 * math.asin(REACH / DISTANCE), width=size, height=size
+        DISTANCE * eyes,
+        [0.0, 0.0, 0.0],
+        vertical_fov=2.0 * math.asin(REACH / DISTANCE),
+        width=size,
+        height=size,
     )
 
 
