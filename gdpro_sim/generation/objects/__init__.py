@@ -7,11 +7,13 @@ parts.
 """
 
 from gdpro_sim.generation.objects import (  # noqa: F401  (each fills NOUNS)
+    nouns_animals,
     nouns_buildings,
     nouns_food,
     nouns_furniture,
     nouns_meals,
     nouns_nature,
+    nouns_tools,
     nouns_toys,
     nouns_vehicles,
     nouns_vessels,

@@ -32,7 +32,7 @@ def isosurface(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Surface of `field` <= 0 inside the box: vertices [V, 3] float32 and faces [F, 3] int32, outward.
 
-    cells: across the longest side of the box. The grid reaches two cells beyond the box and its outermost nodes
+    cells: across the longest side of the box. The grid reaches two cells beyond the box; its outermost nodes
     count as outside. Vertices are shared and lie on grid edges; an empty surface gives empty arrays.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)

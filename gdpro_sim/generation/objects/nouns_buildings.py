@@ -106,7 +106,7 @@ def tower(v: Variation) -> list[Part]:
     ]
 
 
-@noun("castle", "fortress", "sandcastle", kind="buildings", across=30.0, material="stone")
+@noun("castle", "fortress", kind="buildings", across=30.0, material="stone")
 def castle(v: Variation) -> list[Part]:
     half, radius, high = 0.34, v(0.105, 0.06), v(0.42, 0.06)
     wall = 0.26
@@ -300,7 +300,7 @@ def igloo(v: Variation) -> list[Part]:
     ]
 
 
-@noun("tent", "camping tent", "teepee", kind="buildings", across=2.4, material="plush")
+@noun("tent", "camping tent", kind="buildings", across=2.4, material="plush")
 def tent(v: Variation) -> list[Part]:
     width, rise, depth = v(0.8, 0.05), v(0.6, 0.06), 0.86
     body = gable(depth, width, rise)
@@ -458,7 +458,7 @@ def water_well(v: Variation) -> list[Part]:
     ]
 
 
-@noun("birdhouse", "bird house", "doghouse", "dog house", kind="buildings", across=0.4, material="wood")
+@noun("birdhouse", "bird house", kind="buildings", across=0.4, material="wood")
 def birdhouse(v: Variation) -> list[Part]:
     width, wall = v(0.44, 0.05), v(0.4, 0.05)
     body = box(0.4, width, wall) | gable(0.4, width, 0.26).at(z=wall)

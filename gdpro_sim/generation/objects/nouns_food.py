@@ -101,7 +101,7 @@ def orange(v: Variation) -> list[Part]:
     ]
 
 
-@noun("lemon", "lime fruit", kind="fruit and vegetables", across=0.085, material="fruit")
+@noun("lemon", kind="fruit and vegetables", across=0.085, material="fruit")
 def lemon(v: Variation) -> list[Part]:
     radius = v(0.32, 0.05)
     body = (

@@ -193,7 +193,7 @@ def sunflower(v: Variation) -> list[Part]:
     ]
 
 
-@noun("tulip", "rose", "poppy", kind="nature", across=0.35, material="plant")
+@noun("tulip", kind="nature", across=0.35, material="plant")
 def tulip(v: Variation) -> list[Part]:
     stem = curved_tube([(0, 0, 0.16), (0, 0.015, 0.45), (0, 0, 0.7)], 0.028)
     blade = (
@@ -213,7 +213,7 @@ def tulip(v: Variation) -> list[Part]:
     ]
 
 
-@noun("rock", "stone rock", "boulder", "pebble", kind="nature", across=0.5, material="stone")
+@noun("rock", "boulder", "pebble", kind="nature", across=0.5, material="stone")
 def rock(v: Variation) -> list[Part]:
     body = ellipsoid(v(0.42), v(0.5), v(0.36))
     for _ in range(7):

@@ -340,7 +340,7 @@ def helicopter(v: Variation) -> list[Part]:
     size = v(0.19, 0.05)
     cabin = ellipsoid(0.26, size - 0.01, size).at(0.16, 0, 0.29)
     boom = capsule((0.0, 0, 0.32), (-0.44, 0, 0.36), 0.085, 0.035)
-    glass = ellipsoid(0.2, 0.22, 0.17).at(0.31, 0, 0.35)
+    glass = ellipsoid(0.15, 0.22, 0.13).at(0.36, 0, 0.37)
     door = box(0.12, 2, 0.13, 0.02).at(0.06, 0, 0.26)
     fin = side_view([(-0.49, 0.34), (-0.4, 0.34), (-0.44, 0.51), (-0.5, 0.51)], 0.032, 0.008)
     mast = cylinder(0.028, 0.14).at(0.12, 0, 0.44)
