@@ -174,7 +174,7 @@ class SurfelConfig(_Part):
     sh_degree: int = Field(default=0, ge=0, le=3, description="highest SH degree (paper: 3)")
     sh_every: int = Field(default=500, ge=1, description="iterations between degrees (code: 500)")
     tv: float = Field(
-        default=10.0, ge=0.0, description="weight of total variation of colour and depth (paper: 10)"
+        default=0.0, ge=0.0, description="weight of total variation of colour and depth (paper: 10)"
     )
     normal_consistency: float = Field(
         default=500.0,
@@ -188,7 +188,7 @@ class SurfelConfig(_Part):
     densify_until: int = Field(default=230, ge=0, description="last iteration (code: 2500)")
     densify_every: int = Field(default=30, ge=1, description="(code: 100)")
     densify_gradient: float = Field(
-        default=2e-4, gt=0.0, description="view-space position gradient, NDC (code: 2e-4)"
+        default=0.5, gt=0.0, description="view-space position gradient, NDC (code: 2e-4)"
     )
     split_factor: float = Field(
         default=1.6, gt=1.0, description="a split one's scale is divided by this (code: 1.6)"
@@ -207,7 +207,7 @@ class ExtractionConfig(_Part):
     cameras: int = Field(default=24, ge=6, description="views the points are cast from (code: 15)")
     resolution: int = Field(default=256, ge=32, description="pixels across such a view (ours)")
     level: float = Field(default=0.3, gt=0.0, description="density of the level set (code: 0.3)")
-    depth: int = Field(default=7, ge=4, le=11, description="octree depth of screened Poisson (code: 10)")
+    depth: int = Field(default=8, ge=4, le=11, description="octree depth of screened Poisson (code: 10)")
     trim: float = Field(
         default=0.05,
         ge=0.0,
@@ -236,8 +236,8 @@ class RefinementConfig(_Part):
     )
     initial_opacity: float = Field(default=0.7, gt=0.0, lt=1.0, description="(paper: 0.7)")
     sh_degree: int = Field(default=0, ge=0, le=3, description="(paper: 0; code: 3)")
-    lr_vertex: float = Field(default=5e-4, gt=0.0, description="Adam, first step (paper: 1.6e-4 x extent)")
-    lr_vertex_final: float = Field(default=5e-5, gt=0.0, description="Adam, last step (log decay)")
+    lr_vertex: float = Field(default=2e-3, gt=0.0, description="Adam, first step (paper: 1.6e-4 x extent)")
+    lr_vertex_final: float = Field(default=2e-4, gt=0.0, description="Adam, last step (log decay)")
     lr_color: float = Field(default=2e-2, gt=0.0, description="(paper: 5e-3)")
     lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
     lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2; code: 5e-3)")
@@ -252,7 +252,7 @@ class RefinementConfig(_Part):
     flatness: float = Field(
         default=0.2, gt=0.0, le=1.0, description="first scale along the normal over in-plane (paper: 1)"
     )
-    tv: float = Field(default=1.0, ge=0.0, description="weight of total variation of colour (paper: 10)")
+    tv: float = Field(default=0.0, ge=0.0, description="weight of total variation of colour (paper: 10)")
     scale: float = Field(default=0.1, ge=0.0, description="weight of the mean scale (paper)")
     normal_consistency: float = Field(
         default=0.3, ge=0.0, description="weight over adjacent faces (code: 0.3)"
@@ -300,7 +300,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "resolution": 192,
             "densify_until": 90,
         },
-        "extraction": {"resolution": 192, "triangles": 3000},
+        "extraction": {"resolution": 192, "depth": 7, "triangles": 3000},
         "refinement": {"iterations": 120, "resolution": 256},
     },
     "default": {},
@@ -313,7 +313,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "resolution": 384,
             "densify_until": 600,
         },
-        "extraction": {"cameras": 32, "resolution": 384, "depth": 8, "triangles": 16000},
+        "extraction": {"cameras": 32, "resolution": 384, "depth": 9, "triangles": 16000},
         "refinement": {"iterations": 700, "resolution": 640},
     },
     "paper": {
@@ -339,6 +339,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "lr_last": 1.0,
             "sh_degree": 3,
             "normal_consistency": 0.1,
+            "tv": 10.0,
+            "densify_gradient": 2e-4,
             "densify_from": 100,
             "densify_until": 2500,
             "densify_every": 100,
