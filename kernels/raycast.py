@@ -1,4 +1,4 @@
-"""Pictures of a coloured triangle mesh: a ray for each pixel, and several where neighbours differ.
+"""Pictures of a coloured triangle mesh by casting rays, several for each pixel.
 
 Stored colours are sRGB-encoded and are interpolated and averaged as they are stored; a texture times a corner
 colour is a product in linear light (glTF 2.0, section 3.9.2).
@@ -144,6 +144,28 @@ class View:
 
 
 @wp.func
+def put(
+    i: int,
+    sample: Sample,
+    rays: int,
+    rgb_out: wp.array[wp.vec3],
+    alpha_out: wp.array[float],
+    depth_out: wp.array[float],
+    normal_out: wp.array[wp.vec3],
+    with_normals: bool,
+):
+    """Write a pixel's means."""
+    share = 1.0 / float(rays * rays)
+    rgb_out[i] = sample.rgb * share
+    alpha_out[i] = sample.alpha * share
+    depth_out[i] = 0.0
+    if sample.alpha > 0.0:
+        depth_out[i] = sample.depth / sample.alpha
+    if with_normals:
+        normal_out[i] = sample.normal
+
+
+@wp.func
 def view_of(
     camera: int, eyes: wp.array[wp.vec3], rotations: wp.array[wp.mat33], inverse_ks: wp.array[wp.mat33]
 ) -> View:
@@ -189,7 +211,7 @@ def cast(surface: Surface, view: View, x: float, y: float, patch: float, sample:
 
 
 @wp.kernel
-def draw_centres(
+def draw_surface(
     start: int,
     # In:
     surface: Surface,
@@ -205,92 +227,17 @@ def draw_centres(
     depth_out: wp.array[float],
     normal_out: wp.array[wp.vec3],
 ):
-    """One ray through each pixel's centre: colour times opacity, opacity, mean z of what is seen, normal.
+    """Mean of rays x rays rays of a pixel: colour times opacity, opacity, mean z of what is seen, normals.
 
-    `rays` is how many across a pixel there will be at most: it sets how much of a texture one stands for.
-    Normals are times opacity and look towards the camera; they are left out where the surface has none.
+    `rotations` are world to camera. Normals are summed times opacity and look towards the camera; they are
+    left out where the surface has none.
     """
     i = start + wp.tid()
-    view = view_of(i // (width * height), eyes, rotations, inverse_ks)
-    patch = wp.abs(view.inverse_k[0, 0] * view.inverse_k[1, 1]) / float(rays * rays)
-    x = float(i % width) + 0.5
-    y = float((i // width) % height) + 0.5
-    sample = cast(surface, view, x, y, patch, Sample())
-    rgb_out[i] = sample.rgb
-    alpha_out[i] = sample.alpha
-    depth_out[i] = 0.0
-    if sample.alpha > 0.0:
-        depth_out[i] = sample.depth / sample.alpha
-    if surface.corner_normals.shape[0] > 0:
-        normal_out[i] = sample.normal
-
-
-@wp.func
-def differs(
-    i: int,
-    j: int,
-    k: int,
-    tolerance: float,
-    bend: float,
-    rgb: wp.array[wp.vec3],
-    alpha: wp.array[float],
-    depth: wp.array[float],
-) -> bool:
-    """Pixel i differs from j or k on either side of it, or z bends between the three."""
-    apart = wp.max(wp.max(wp.abs(rgb[j] - rgb[i])), wp.max(wp.abs(rgb[k] - rgb[i])))
-    apart = wp.max(apart, wp.max(wp.abs(alpha[j] - alpha[i]), wp.abs(alpha[k] - alpha[i])))
-    return apart > tolerance or wp.abs(depth[j] + depth[k] - 2.0 * depth[i]) > bend
-
-
-@wp.kernel
-def refine_edges(
-    start: int,
-    # In:
-    surface: Surface,
-    eyes: wp.array[wp.vec3],
-    rotations: wp.array[wp.mat33],
-    inverse_ks: wp.array[wp.mat33],
-    width: int,
-    height: int,
-    rays: int,
-    tolerance: float,
-    bend: float,
-    rgb: wp.array[wp.vec3],
-    alpha: wp.array[float],
-    depth: wp.array[float],
-    # Out:
-    rgb_out: wp.array[wp.vec3],
-    alpha_out: wp.array[float],
-    depth_out: wp.array[float],
-    normal_out: wp.array[wp.vec3],
-):
-    """The mean of rays x rays rays where a pixel's centre differs from one of its four neighbours.
-
-    Differing: a colour or opacity by more than `tolerance`, z by more than `bend` off the line through both
-    sides (times two). Other pixels keep what is there. At the picture's rim the pixel is its own neighbour.
-    """
-    i = start + wp.tid()
-    row = (i // width) % height
-    column = i % width
-    left = i - wp.min(column, 1)
-    right = i + wp.min(width - 1 - column, 1)
-    up = i - wp.min(row, 1) * width
-    down = i + wp.min(height - 1 - row, 1) * width
-    across = differs(i, left, right, tolerance, bend, rgb, alpha, depth)
-    if not across and not differs(i, up, down, tolerance, bend, rgb, alpha, depth):
-        return
     view = view_of(i // (width * height), eyes, rotations, inverse_ks)
     patch = wp.abs(view.inverse_k[0, 0] * view.inverse_k[1, 1]) / float(rays * rays)
     sample = Sample()
     for k in range(rays * rays):
-        x = float(column) + (float(k % rays) + 0.5) / float(rays)
-        y = float(row) + (float(k // rays) + 0.5) / float(rays)
+        x = float(i % width) + (float(k % rays) + 0.5) / float(rays)
+        y = float((i // width) % height) + (float(k // rays) + 0.5) / float(rays)
         sample = cast(surface, view, x, y, patch, sample)
-    share = 1.0 / float(rays * rays)
-    rgb_out[i] = sample.rgb * share
-    alpha_out[i] = sample.alpha * share
-    depth_out[i] = 0.0
-    if sample.alpha > 0.0:
-        depth_out[i] = sample.depth / sample.alpha
-    if surface.corner_normals.shape[0] > 0:
-        normal_out[i] = sample.normal
+    put(i, sample, rays, rgb_out, alpha_out, depth_out, normal_out, surface.corner_normals.shape[0] > 0)

@@ -1,4 +1,4 @@
-"""Pictures to compare with: of a mesh by casting rays, of Gaussians by splatting, and depth as an image.
+"""Pictures to compare with: of a mesh, of Gaussians, and depth as an image.
 
 Colours are plain sRGB-encoded albedo: no light is put on them.
 """
@@ -6,7 +6,6 @@ Colours are plain sRGB-encoded albedo: no light is put on them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,10 @@ import warp as wp
 
 from gdpro_sim.binding import face_normals, vertex_normals
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.device import launch_chunked, resolve_device
+from gdpro_sim.device import launch_chunked, resolve_device, thread_count
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.generation.protocols import ImageKind
-from gdpro_sim.kernels import raycast
+from gdpro_sim.kernels import rasterize, raycast
 from gdpro_sim.meshing.color import SurfaceColors, Texture
 from gdpro_sim.meshing.repair import face_areas
 from gdpro_sim.meshing.surface import SurfaceMesh
@@ -27,11 +26,8 @@ from gdpro_sim.splatting import rasterization
 FLOOR = 0.1
 """Disparity of the farthest point of the object: above the 0 of nothing."""
 
-TOLERANCE = 3.0 / 255.0
-"""Neighbouring pixels whose colours and opacities differ by no more are one ray each."""
-
-BEND = 0.06
-"""The same for depth, in the unit frame: twice how far it may lie off the line through its neighbours'."""
+CLEAR = 0.05
+"""Least distance of a camera from the sphere around a mesh that is drawn by a z-buffer."""
 
 SMOOTH = 0.8
 """Cosine between a face's and a vertex's normal above which the edge between them is drawn round."""
@@ -77,10 +73,13 @@ def disparity(depths: torch.Tensor, alphas: torch.Tensor, cameras: Cameras) -> t
 
 
 class MeshRenderer:
-    """Draws a coloured mesh from any camera by casting rays; made once, drawn often.
+    """Draws a coloured mesh from any camera; made once, drawn often.
 
     mesh: in the unit frame. Both sides of a face show; where a colour's or a cutout texture's alpha is below
     1, what lies behind shows through. device: "auto", "cpu" or a CUDA device; pictures lie there.
+
+    On a CPU an opaque mesh goes through a z-buffer, unless a camera is within the sphere around it; else rays
+    are cast. Both take the same samples.
     """
 
     def __init__(self, mesh: SurfaceMesh, *, device: str = "cpu", normals: bool = False) -> None:
@@ -90,21 +89,21 @@ class MeshRenderer:
             indices=wp.array(mesh.faces.ravel(), dtype=wp.int32, device=self.device),
         )
         self._normals = normals
+        colors = _plain_colors(mesh)
         surface = raycast.Surface()
         surface.mesh = self._mesh.id
-        surface.corner_colors = self._array(_plain_colors(mesh), wp.vec4)
+        surface.corner_colors = self._array(colors, wp.vec4)
         surface.corner_normals = self._array(
             corner_normals(mesh).reshape(-1, 3) if normals else np.zeros((0, 3)), wp.vec3
         )
         self._add_textures(surface, mesh)
         self._surface = surface
+        cutout = any(m.cutout and m.texture is not None for m in mesh.materials)
+        self._opaque = bool((colors[:, 3] == 1.0).all()) and not (cutout and mesh.uv is not None)
+        self._reach = float(np.linalg.norm(mesh.vertices, axis=1).max())
 
     def render(self, cameras: Cameras, rays: int = 2) -> Renders:
-        """Pictures from C cameras.
-
-        A pixel is the mean of `rays` x `rays` rays where its centre differs from a neighbour's by more than
-        `TOLERANCE` in colour or opacity, or by `BEND` in depth; else its centre.
-        """
+        """Pictures from C cameras, each pixel the mean of `rays` x `rays` samples."""
         count, width, height = len(cameras), cameras.width, cameras.height
         on = torch.device(self.device)
 
@@ -113,28 +112,87 @@ class MeshRenderer:
 
         rgb, alphas, depths = empty(3), empty(1), empty(1)
         normals = empty(3) if self._normals else None
-        inputs = [
-            self._surface,
-            self._array(cameras.positions.cpu().numpy(), wp.vec3),
-            self._array(cameras.viewmats[:, :3, :3].cpu().numpy(), wp.mat33),
-            self._array(torch.linalg.inv(cameras.Ks.double()).cpu().numpy(), wp.mat33),
-            width,
-            height,
-            rays,
+        outputs = [
+            wp.from_torch(rgb.view(-1, 3), dtype=wp.vec3),
+            wp.from_torch(alphas.view(-1)),
+            wp.from_torch(depths.view(-1)),
+            None if normals is None else wp.from_torch(normals.view(-1, 3), dtype=wp.vec3),
         ]
-        outputs = _flat(rgb, alphas, depths, normals)
-        launch = partial(launch_chunked, count=count * height * width, device=self.device, minimum=512)
-        launch(raycast.draw_centres, inputs=inputs, outputs=outputs)
-        if rays > 1:
-            centres = _flat(rgb.clone(), alphas.clone(), depths.clone())[:3]
-            launch(
-                raycast.refine_edges,
-                inputs=[*inputs, TOLERANCE, BEND, *centres],
-                outputs=outputs,
-            )
+        outside = float(cameras.positions.norm(dim=1).min()) > self._reach + CLEAR
+        if self.device == "cpu" and self._opaque and outside:
+            self._rasterize(cameras, rays, outputs)
+        else:
+            self._cast(cameras, rays, outputs)
         if normals is not None:
             normals = torch.nn.functional.normalize(normals, dim=-1)
         return Renders(cameras, rgb, alphas, depths, normals)
+
+    def _cast(self, cameras: Cameras, rays: int, outputs: list[Any]) -> None:
+        width, height = cameras.width, cameras.height
+        eyes, rotations, _, inverses = self._views(cameras)
+        launch_chunked(
+            raycast.draw_surface,
+            len(cameras) * height * width,
+            [self._surface, eyes, rotations, inverses, width, height, rays],
+            outputs,
+            device=self.device,
+            minimum=512,
+        )
+
+    def _rasterize(self, cameras: Cameras, rays: int, outputs: list[Any]) -> None:
+        count, width, height = len(cameras), cameras.width, cameras.height
+        vertices, faces = self._mesh.points, self._mesh.indices
+        samples = count * height * width * rays * rays
+        projected = wp.empty(count * len(vertices), dtype=wp.vec3, device=self.device)
+        nearest = wp.zeros(samples, dtype=wp.float32, device=self.device)
+        face = wp.full(samples, -1, dtype=wp.int32, device=self.device)
+        eyes, rotations, ks, inverses = self._views(cameras)
+        bands = -(-thread_count() // count)
+        for kernel, size, minimum, inputs, written in (
+            (
+                rasterize.project_vertices,
+                len(projected),
+                8192,
+                [vertices, eyes, rotations, ks, rays],
+                [projected],
+            ),
+            (
+                rasterize.draw_faces,
+                count * bands,
+                1,
+                [projected, faces, len(vertices), width * rays, height * rays, bands],
+                [nearest, face],
+            ),
+            (
+                rasterize.shade,
+                count * height * width,
+                2048,
+                [
+                    self._surface,
+                    projected,
+                    faces,
+                    len(vertices),
+                    inverses,
+                    width,
+                    height,
+                    rays,
+                    nearest,
+                    face,
+                ],
+                outputs,
+            ),
+        ):
+            launch_chunked(kernel, size, inputs, written, device=self.device, minimum=minimum)
+
+    def _views(self, cameras: Cameras) -> tuple[Any, Any, Any, Any]:
+        """Eyes, rotations, intrinsics and their inverses as Warp arrays."""
+        ks = cameras.Ks.double().cpu().numpy()
+        return (
+            self._array(cameras.positions.cpu().numpy(), wp.vec3),
+            self._array(cameras.viewmats[:, :3, :3].cpu().numpy(), wp.mat33),
+            self._array(ks, wp.mat33),
+            self._array(np.linalg.inv(ks), wp.mat33),
+        )
 
     def _array(self, values: np.ndarray, dtype: Any) -> Any:
         kind = {wp.int32: np.int32, wp.vec3i: np.int32, wp.vec4ub: np.uint8}.get(dtype, np.float32)
@@ -201,18 +259,6 @@ class GaussianRenderer:
         )
         rgb, depths = image[..., :3], image[..., 3:]
         return Renders(cameras, torch.minimum(rgb, alphas), alphas, torch.where(alphas > 0.0, depths, 0.0))
-
-
-def _flat(
-    rgb: torch.Tensor, alphas: torch.Tensor, depths: torch.Tensor, normals: torch.Tensor | None = None
-) -> list[Any]:
-    """Pictures as Warp arrays over pixels."""
-    return [
-        wp.from_torch(rgb.view(-1, 3), dtype=wp.vec3),
-        wp.from_torch(alphas.view(-1)),
-        wp.from_torch(depths.view(-1)),
-        None if normals is None else wp.from_torch(normals.view(-1, 3), dtype=wp.vec3),
-    ]
 
 
 def corner_normals(mesh: SurfaceMesh) -> np.ndarray:

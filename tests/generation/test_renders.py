@@ -163,6 +163,33 @@ def test_half_opaque_faces_blend_with_those_behind() -> None:
     assert float(seen.depths[0, 8, 8]) == pytest.approx(0.25 * 2.8 + 0.75 * 3.0, abs=1e-5)
 
 
+@pytest.mark.parametrize("rays", [1, 2, 3])
+def test_the_z_buffer_and_cast_rays_give_the_same_pictures(rays: int) -> None:
+    mesh = coloured(*shapes.joined(shapes.sphere(2, 0.9), shapes.sphere(1, 0.5)))
+    cameras = Cameras.look_at(
+        [[2.5, 0.4, 0.8], [0.0, -1.2, -0.3]], (0, 0, 0.1), vertical_fov=0.7, width=40, height=30
+    )
+    renderer = MeshRenderer(mesh, normals=True)
+    seen = renderer.render(cameras, rays)
+    renderer._opaque = False
+    cast = renderer.render(cameras, rays)
+    for name, limit in (("rgb", 1e-4), ("alphas", 1e-6), ("depths", 1e-4), ("normals", 1e-3)):
+        apart = (getattr(seen, name) - getattr(cast, name)).abs().amax(-1)
+        # A sample on the edge of two faces, or of the object, may go to either.
+        assert float((apart > limit).float().mean()) < 0.004, name
+    assert float(seen.alphas.min()) == 0.0
+    assert float(seen.alphas.max()) == 1.0
+
+
+def test_a_camera_within_the_sphere_around_a_mesh_sees_its_inside() -> None:
+    renderer = MeshRenderer(SurfaceMesh.from_arrays(*shapes.sphere(3, 1.0)), normals=True)
+    inside = Cameras.look_at([[0.3, 0.0, 0.0]], (0, 0, 0), vertical_fov=1.0, width=16, height=16)
+    seen = renderer.render(inside)
+    assert float(seen.alphas.min()) == 1.0
+    assert float(seen.depths[0, 8, 8]) == pytest.approx(1.3, abs=0.02)
+    assert float(seen.normals[0, 8, 8, 0]) > 0.98  # towards the camera
+
+
 @pytest.fixture
 def threads() -> Iterator[None]:
     before = thread_count()
