@@ -115,7 +115,7 @@ class ScoreDistillation:
         with beside_torch(x0):
             own = torch.randn(x0.shape, generator=generator, device=generator.device)
             shared = torch.randn(x0.shape[-1], generator=generator, device=generator.device)
-            return (own + self.config.shared_noise * shared).to(x0.device)
+            return own.add_(shared, alpha=self.config.shared_noise).to(x0.device)
 
     def invert(self, x0: torch.Tensor, noise: torch.Tensor, s: int, views: ViewBatch) -> torch.Tensor:
         """x_s: x_0 noised at t = 1, taken upward by DDIM with the predictions for the empty prompt."""

@@ -225,6 +225,17 @@ def test_pixels_of_deepfloyd(tmp_path: Path) -> None:
     # Pixels go through no network: the gradient arrives as it is, twice for [-1, 1] (or mirrored).
     assert result.gradient.shape == images.shape
     assert any(torch.allclose(images.grad, 2.0 * g) for g in (result.gradient, result.gradient.flip(2)))
+    # Of what the network says only the noise counts, not the variance beside it.
+    predicted = guide.noise_prediction(x0.detach(), 300, "empty", views)
+    with torch.no_grad():
+        output = guide._unet(
+            x0.permute(0, 3, 1, 2), 300, encoder_hidden_states=guide._embeddings["empty"].expand(2, -1, -1)
+        ).sample
+    assert output.shape[1] == 6
+    torch.testing.assert_close(predicted, output[:, :3].permute(0, 2, 3, 1), rtol=1e-4, atol=1e-5)
+    # Reduced fourfold, noise of standard deviation 0.29 averages out.
+    reduced = guide.encode(pictures(size=4 * tiny_pipeline.PIXELS), views)
+    assert float(reduced.detach().std()) < 2.0 * 0.29 / 3.0
     with pytest.raises(
         GuidanceError, match=r"guidance.space=latent, but .* works on pixels: use auto or pixel"
     ):
@@ -318,6 +329,24 @@ def test_models_that_are_not_there(saved: Path, tmp_path: Path, monkeypatch: pyt
     checkpoint.write_bytes(b"x")
     with pytest.raises(GuidanceError, match=rf"is a file: {passing} pipeline's directory"):
         guidance(checkpoint)
+
+
+def test_a_model_in_the_hubs_cache_needs_no_network(
+    saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    cached, commit = tmp_path / "models--someone--tiny-sd", "0123456789abcdef" * 2 + "01234567"
+    shutil.copytree(saved, cached / "snapshots" / commit)
+    (cached / "refs").mkdir()
+    (cached / "refs" / "main").write_text(commit)
+    guide = guidance("someone/tiny-sd")
+    words = guide.describe()
+    assert words["model"] == "someone/tiny-sd" and words["revision"] == commit
+    expected = guidance(saved).noise_prediction(noise(), 300, "prompt", VIEWS)
+    assert torch.equal(guide.noise_prediction(noise(), 300, "prompt", VIEWS), expected)
 
 
 def test_models_that_are_damaged(saved: Path, tmp_path: Path) -> None:

@@ -210,7 +210,7 @@ def test_a_checkpoint_that_would_run_code_is_refused(saved: Path, tmp_path: Path
 def test_bad_requests_are_one_clear_line(
     saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    passing = r"pass --prior shap-e --set prior.model=DIR with"
+    passing = r"pass --prior shap-e --prior-model DIR with"
     with pytest.raises(GuidanceError, match=rf"no diffusion model given: {passing}"):
         prior(None)
     (tmp_path / "empty").mkdir()

@@ -66,7 +66,7 @@ TOKENS = 77
 SMALLEST_ALPHA = 2.0**-24
 """alpha_bar of schedules that end in pure noise, where it would be zero."""
 
-HALF_GRADIENT_SCALE = 1024.0
+HALF_GRADIENT_SCALE = 128.0
 """Gradients travel through a float16 encoder times this, so that small ones do not round to zero."""
 
 
@@ -351,8 +351,8 @@ def _schedule(scheduler: Any, model: str) -> tuple[str, torch.Tensor]:
         raise GuidanceError(
             f"{model} predicts {prediction!r}; pass a model that predicts epsilon, v_prediction or sample"
         )
-    # Without both, a config that does not name them gets a scheduler that clips predictions.
-    ddim = diffusers.DDIMScheduler.from_config(config, clip_sample=False, thresholding=False)
+    with quiet():
+        ddim = diffusers.DDIMScheduler.from_config(config)  # for its schedule alone: it takes no step
     alphas = ddim.alphas_cumprod
     if alphas.shape != (STEPS,):
         raise GuidanceError(f"{model} was trained with {len(alphas)} steps of noise; {STEPS} are needed")

@@ -30,7 +30,7 @@ from gdpro_sim.meshing.surface import MeshMaterial, SurfaceMesh
 
 log = logging.getLogger(__name__)
 
-OPTION = "--prior shap-e --set prior.model=DIR"
+OPTION = "--prior shap-e --prior-model DIR"
 
 ACCEPTED = {"ShapEPipeline": "Shap-E text-to-3D pipeline"}
 
@@ -97,7 +97,7 @@ class ShapEPrior:
         """
         text = (self.config.prompt or prompt).strip()
         if not text:
-            raise GuidanceError("the prompt is empty: Shap-E needs one, e.g. prior.prompt='a red mug'")
+            raise GuidanceError("the prompt is empty: Shap-E needs one, e.g. --prior-prompt 'a red mug'")
         pipeline = load_pipeline(self.folder, OPTION)
         if self._cap3d is not None:
             load_fine_tuned(pipeline.prior, self._cap3d)
