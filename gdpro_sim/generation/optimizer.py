@@ -83,7 +83,10 @@ class Adam:
         return state
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Raises KeyError where a leaf is missing, ValueError where one has not the shape of its rows."""
+        """Raises KeyError where a leaf is missing, ValueError for one too many or of another shape."""
+        surplus = set(state) - set(self.state_dict())
+        if surplus:
+            raise ValueError(f"unexpected: {', '.join(sorted(surplus))}")
         parts = {}
         for name, value in self.parameters.items():
             parts[name] = [state[f"{name}{suffix}"] for suffix in ("", ".first", ".second")]

@@ -135,6 +135,9 @@ class SurfelStage:
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Raises KeyError or ValueError where the state is not that of such a stage."""
+        rows = {len(state[f"adam.{name}"]) for name in self._adam.parameters}
+        if len(rows | {len(state["densification.sums"])}) > 1:
+            raise ValueError(f"every leaf must have as many rows, got {sorted(rows)}")
         self._adam.load_state_dict(nested(state, "adam"))
         self._densification.load_state_dict(nested(state, "densification"))
         self._distillation.load_state_dict(nested(state, "score"))

@@ -16,6 +16,7 @@ from gdpro_sim.generation.refinement import RefinementStage, bound_start
 from gdpro_sim.generation.surfels import SurfelStage
 from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.repair import face_normals, validate
+from tests.conditions import needs_gpu
 from tests.generation.meshes import ball, small
 
 MODES = ["bound", "frozen", "unbound", "textured-mesh"]
@@ -163,3 +164,14 @@ def test_what_cannot_be_bound_is_refused() -> None:
     state = stage_of("bound").state_dict()
     with pytest.raises(ValueError, match="rows"):
         RefinementStage(mesh, guidance, small(), 0).load_state_dict(state)
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_a_step_on_the_gpu_is_that_of_the_cpu() -> None:
+    reports = []
+    for device in ("cpu", "cuda"):
+        stage = RefinementStage(ball(2), MeshGuidance(ball(3), device=device), small(), 0)
+        reports.append(stage.step())
+        assert stage.result().vertices.device.type == device
+    assert reports[1].loss == pytest.approx(reports[0].loss, rel=1e-2)

@@ -15,6 +15,7 @@ from gdpro_sim.generation.config import GuidanceConfig
 from gdpro_sim.generation.guidance.views import MeshGuidance
 from gdpro_sim.generation.surfels import SurfelStage, facing, sample_surface
 from gdpro_sim.meshing.surface import SurfaceMesh
+from tests.conditions import needs_gpu
 from tests.generation.meshes import ball, small
 
 
@@ -181,3 +182,27 @@ def test_guidance_sees_pictures_reduced_by_the_supersampling() -> None:
     guidance.encode = lambda images, views: seen.append(images.shape) or inner(images, views)  # type: ignore
     SurfelStage(ball(2), guidance, config, 0).step()
     assert seen == [(2, 32, 32, 3)]
+
+
+def test_a_state_that_does_not_fit_is_refused() -> None:
+    mesh = ball(1)
+    stage = SurfelStage(mesh, MeshGuidance(mesh), small(), 0)
+    state = stage.state_dict()
+    with pytest.raises(ValueError, match="as many rows"):
+        stage.load_state_dict({**state, "adam.logits": state["adam.logits"][:-1]})
+    coloured = SurfelStage(mesh, MeshGuidance(mesh), small(surfels={"sh_degree": 1}), 0)
+    with pytest.raises(KeyError):
+        coloured.load_state_dict(state)
+    with pytest.raises(ValueError, match=r"unexpected: rest"):
+        stage.load_state_dict(coloured.state_dict())
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_a_step_on_the_gpu_is_that_of_the_cpu() -> None:
+    reports = []
+    for device in ("cpu", "cuda"):
+        stage = SurfelStage(ball(2), MeshGuidance(ball(3), device=device), small(), 0)
+        reports.append(stage.step())
+        assert stage.result().means.device.type == device
+    assert reports[1].loss == pytest.approx(reports[0].loss, rel=1e-2)
