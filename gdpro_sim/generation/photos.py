@@ -163,29 +163,37 @@ class Photos:
             step = np.array([own[0, 0] / k[0, 0], own[1, 1] / k[1, 1]])  # photo pixels in one of the view
             corner = own[:2, 2] - k[:2, 2] * step
             picture = self.pictures[index]
-            rows = _overlaps(corner[1], step[1], cameras.height, picture.shape[0])
-            columns = _overlaps(corner[0], step[0], cameras.width, picture.shape[1])
+            rows = corner[1] + step[1] * np.arange(cameras.height + 1)
+            columns = corner[0] + step[0] * np.arange(cameras.width + 1)
             out.append(_resampled(picture, rows, columns))
         return torch.stack(out)
 
 
-def _overlaps(start: float, step: float, count: int, size: int) -> tuple[slice, torch.Tensor]:
-    """Pixels `slice` of a line of `size` and the mean over each of `count` stretches: weights [count, n]."""
-    edges = np.clip(start + step * np.arange(count + 1), 0.0, size)
-    first, last = int(np.floor(edges[0])), int(np.ceil(edges[-1]))
-    pixels = np.arange(first, max(last, first + 1))
-    lengths = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
-    weights = np.maximum(lengths, 0.0)
-    weights /= np.maximum(weights.sum(1, keepdims=True), 1e-12)
-    return slice(first, first + len(pixels)), torch.from_numpy(weights.astype(np.float32))
+def _resampled(picture: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> torch.Tensor:
+    """Means of a picture over a grid of cells with edges at `rows` [H + 1] and `columns` [W + 1], pixels.
+
+    float32 [H, W, 4], colour times opacity. Sums up to an edge are whole numbers, so nothing is rounded
+    before the difference of two of them is taken.
+    """
+    rows, columns = np.clip(rows, 0.0, picture.shape[0]), np.clip(columns, 0.0, picture.shape[1])
+    top, left = int(rows[0]), int(columns[0])
+    part = picture[top : int(np.ceil(rows[-1])), left : int(np.ceil(columns[-1]))]
+    products = part.astype(np.uint16) * part[..., 3:]
+    products[..., 3] = part[..., 3] * np.uint16(255)
+    means = _means(products, rows - top, np.int64 if len(part) > 30_000 else np.int32)
+    means = _means(means.swapaxes(0, 1), columns - left, np.float64).swapaxes(0, 1)
+    return torch.from_numpy(np.clip(means / 255.0**2, 0.0, 1.0).astype(np.float32))
 
 
-def _resampled(
-    picture: np.ndarray, rows: tuple[slice, torch.Tensor], columns: tuple[slice, torch.Tensor]
-) -> torch.Tensor:
-    part = torch.from_numpy(picture[rows[0], columns[0]].astype(np.float32) / 255.0)
-    part = torch.cat([part[..., :3] * part[..., 3:], part[..., 3:]], -1)
-    return torch.einsum("rh,hwc,vw->rvc", rows[1], part, columns[1]).clamp_(0.0, 1.0)
+def _means(values: np.ndarray, edges: np.ndarray, kind: type[np.generic]) -> np.ndarray:
+    """Means of values [N, ...] along the first axis between edges [M + 1] in [0, N]; float64 [M, ...]."""
+    sums = np.zeros((len(values) + 1, *values.shape[1:]), kind)
+    np.cumsum(values, axis=0, dtype=kind, out=sums[1:])
+    whole = np.minimum(edges.astype(np.int64), len(values) - 1)
+    part = (edges - whole).reshape(-1, *[1] * (values.ndim - 1))
+    up_to = sums[whole] * (1.0 - part) + sums[whole + 1] * part
+    lengths = np.maximum(np.diff(edges), 1e-12).reshape(-1, *[1] * (values.ndim - 1))
+    return np.diff(up_to, axis=0) / lengths
 
 
 __all__ = ["LEAST", "Photos", "too_few"]

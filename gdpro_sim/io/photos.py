@@ -21,8 +21,8 @@ from gdpro_sim.meshing.rawmesh import image_array
 
 log = logging.getLogger(__name__)
 
-LARGEST = 800
-"""Longest side in pixels; larger photos are reduced (training views have a few hundred)."""
+LARGEST = 512
+"""Longest side in pixels; larger photos are reduced: training views have about 200 across the object."""
 
 OPAQUE = 250
 """A picture without a pixel below this opacity has no alpha worth the name."""
