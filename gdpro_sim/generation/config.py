@@ -232,13 +232,13 @@ class RefinementConfig(_Part):
         default=2, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
     )
     per_triangle: int = Field(
-        default=6, ge=1, description="Gaussians on a triangle: 1, 3, 4, 6, 10, ... (code: 55)"
+        default=10, ge=1, description="Gaussians on a triangle: 1, 3, 4, 6, 10, ... (code: 55)"
     )
     initial_opacity: float = Field(default=0.7, gt=0.0, lt=1.0, description="(paper: 0.7)")
     sh_degree: int = Field(default=0, ge=0, le=3, description="(paper: 0; code: 3)")
     lr_vertex: float = Field(default=2e-3, gt=0.0, description="Adam, first step (paper: 1.6e-4 x extent)")
     lr_vertex_final: float = Field(default=2e-4, gt=0.0, description="Adam, last step (log decay)")
-    lr_color: float = Field(default=2e-2, gt=0.0, description="(paper: 5e-3)")
+    lr_color: float = Field(default=4e-2, gt=0.0, description="(paper: 5e-3)")
     lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
     lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2; code: 5e-3)")
     lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
@@ -247,7 +247,7 @@ class RefinementConfig(_Part):
         default=0.1, gt=0.0, le=1.0, description="last over first rate of all but positions (paper: 1)"
     )
     smoothing: float = Field(
-        default=10.0, ge=0.0, description="lambda of vertex steps (1 + lambda L)^-1, Large Steps (paper: 0)"
+        default=3.0, ge=0.0, description="lambda of vertex steps (1 + lambda L)^-1, Large Steps (paper: 0)"
     )
     flatness: float = Field(
         default=0.2, gt=0.0, le=1.0, description="first scale along the normal over in-plane (paper: 1)"
@@ -292,7 +292,7 @@ class GenerationConfig(_Part):
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
-        "guidance": {"resolution": 128},
+        "guidance": {"resolution": 96},
         "surfels": {
             "iterations": 120,
             "initial": 4000,
@@ -301,11 +301,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "densify_until": 90,
         },
         "extraction": {"resolution": 192, "depth": 7, "triangles": 3000},
-        "refinement": {"iterations": 120, "resolution": 256},
+        "refinement": {"iterations": 120, "resolution": 256, "per_triangle": 6},
     },
     "default": {},
     "high": {
-        "guidance": {"resolution": 288},
+        "guidance": {"resolution": 256},
         "surfels": {
             "iterations": 900,
             "initial": 12000,
