@@ -1,7 +1,7 @@
 # gdpro-sim: `make` prints this help, `make demo` runs the default scene, `make test` runs the tests.
 PYTHON ?= python3
 VENV   ?= .venv
-SCENE  ?= jelly_bunny
+SCENE  ?= rubber_duck
 OUT    ?= out/$(notdir $(basename $(SCENE)))
 PIP    := $(VENV)/bin/python -m pip
 READY  := $(VENV)/.ready
@@ -30,7 +30,7 @@ $(DEV): $(READY)
 
 setup: $(READY)  ## make the virtual environment and install the package
 
-demo: $(READY)  ## run the default scene and print where the results lie
+demo: $(READY)  ## generate a duck from words, drop it, print where the results lie
 	$(VENV)/bin/gdpro simulate $(SCENE) -o $(OUT)
 
 test: $(DEV)  ## run all tests (slow ones included, the wheel test excepted)

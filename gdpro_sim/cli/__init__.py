@@ -56,7 +56,11 @@ def main() -> None:
             print(f"gdpro: {line}", file=sys.stderr)
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        kept = "; finished frames are kept, the same command continues" if "simulate" in sys.argv else ""
+        kept = ""
+        if "simulate" in sys.argv:
+            kept = "; finished frames are kept, the same command continues"
+        elif "generate" in sys.argv and ("--run" in sys.argv or "--resume" in sys.argv):
+            kept = "; the last checkpoint is kept, the same command continues"
         print(f"gdpro: interrupted{kept}", file=sys.stderr)
         sys.exit(130)
     except _Terminated:

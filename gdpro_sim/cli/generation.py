@@ -235,6 +235,6 @@ def vocabulary(json_output: AsJson = False, quiet: Quiet = False, debug: Debug =
     if json_output:
         print(json.dumps(words))
     elif quiet:
-        print("\n".join(words["nouns"]))
+        print("\n".join(sorted(objects.NOUNS)))
     else:
         show({kind: ", ".join(listed) for kind, listed in words.items()}, "Vocabulary", False, False)
