@@ -13,6 +13,7 @@ from gdpro_sim.generation.objects import (  # noqa: F401  (each fills NOUNS)
     nouns_furniture,
     nouns_meals,
     nouns_nature,
+    nouns_things,
     nouns_tools,
     nouns_toys,
     nouns_vehicles,

@@ -138,7 +138,7 @@ class ParametricObject:
         return _nearest(self.parts, self._own(points))
 
     def surface(self, resolution: int, *, detail: bool = True) -> SurfaceMesh:
-        """Closed coloured surface in metres, `resolution` cells across its longest side.
+        """Closed coloured surface of one piece in metres, `resolution` cells across its longest side.
 
         detail=False is the deliberately coarse one: each part in its plain base colour. Parts too thin for
         the cells are thickened a little. Raises `MeshError` for fewer than 8 cells.
@@ -281,17 +281,27 @@ def _nearest(parts: tuple[Part, ...], p: np.ndarray) -> np.ndarray:
     return out
 
 
+CRUMB = 1e-3
+"""Pieces smaller than this share of the largest one are dropped without a second try."""
+
+
 def largest_piece(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-    """The connected piece of largest area-free volume, and whether it was the only one."""
+    """The connected piece of largest volume, and whether nothing but hollows and crumbs went with the others.
+
+    A hollow inside has negative volume; without its surface it is filled.
+    """
     if not len(faces):
         return vertices, faces, False
     label = face_components(faces)
     if not label.any():
         return vertices, faces, True
-    volumes = [signed_volume(vertices, faces[label == i]) for i in range(int(label.max()) + 1)]
-    kept = faces[label == int(np.argmax(volumes))]
+    volumes = np.asarray([signed_volume(vertices, faces[label == i]) for i in range(int(label.max()) + 1)])
+    largest = int(volumes.argmax())
+    kept = faces[label == largest]
     used, compact = np.unique(kept, return_inverse=True)
-    return vertices[used], compact.reshape(-1, 3).astype(np.int32), False
+    others = np.delete(volumes, largest)
+    whole = bool((others < CRUMB * volumes[largest]).all())
+    return vertices[used], compact.reshape(-1, 3).astype(np.int32), whole
 
 
 def build(spec: ObjectSpec, seed: int) -> ParametricObject:

@@ -59,7 +59,7 @@ def _phrases() -> dict[str, dict[str, str]]:
     parts: dict[str, str] = {}
     for known in NOUNS.values():
         for part in known.part_names():
-            parts[part] = part
+            parts |= {part: part, singular(part): part}
     return {
         "noun": nouns | {singular(n): name for n, name in nouns.items() if singular(n) not in nouns},
         "part": parts,
@@ -110,8 +110,14 @@ def _tokens(prompt: str) -> list[str]:
     return re.findall(r"[^\W_]+|[,&]", text)
 
 
+@cache
+def _ignored_phrases() -> list[list[str]]:
+    """The longest first."""
+    return sorted((_tokens(phrase) for phrase in w.IGNORED), key=len, reverse=True)
+
+
 def _without_ignored(tokens: list[str]) -> tuple[list[str], tuple[str, ...]]:
-    phrases = sorted((_tokens(phrase) for phrase in w.IGNORED), key=len, reverse=True)
+    phrases = _ignored_phrases()
     ignored: list[str] = []
     out: list[str] = []
     i = 0
@@ -141,8 +147,8 @@ def _words(tokens: list[str]) -> list[_Word]:
                     kinds[kind] = known[text]
                 elif kind == "noun" and singular(text) in known:
                     kinds[kind] = known[singular(text)]
-                elif kind == "part" and (same := _same_part(text, list(known))):
-                    kinds[kind] = same
+                elif kind == "part" and singular(text) in known:
+                    kinds[kind] = known[singular(text)]
             joiner = text in w.JOINERS or text in w.ARTICLES or text in w.COUNTS or text.isdigit()
             if kinds or length == 1:
                 out.append(_Word(text, {"joiner": text} if joiner and not kinds else kinds))
@@ -212,7 +218,7 @@ class _Reader:
         )
 
     def _unknown_error(self) -> GuidanceError:
-        known = sorted({phrase for kind in _phrases().values() for phrase in kind})
+        known = sorted({phrase for kind, words in _phrases().items() if kind != "part" for phrase in words})
         hints = []
         for word in self.unknown:
             near = difflib.get_close_matches(singular(word), known, n=3, cutoff=0.6)
@@ -291,7 +297,10 @@ class _Reader:
         gathered = _Gathered()
         for i, word in enumerate(tail):
             name = _same_part(word.text, own)
-            ends = i + 1 == len(tail) or "joiner" in tail[i + 1].kinds
+            after = tail[i + 1].kinds if i + 1 < len(tail) else {}
+            ends = i + 1 == len(tail) or "joiner" in after
+            if "shade" in word.kinds and "color" in after:
+                name = None
             if name is not None and not (self._is_attribute(word) and not ends):
                 if gathered.said:
                     parts[name] = gathered.style()

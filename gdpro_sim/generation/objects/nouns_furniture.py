@@ -306,6 +306,7 @@ def clock(v: Variation) -> list[Part]:
         .mirrored(1)
     )
     feet = capsule((0, 0.2, 0.2), (0, 0.3, 0.04), 0.04).mirrored(1)
+    posts = capsule((0, 0.12, 0.65), (0, 0.21, 0.8), 0.035).mirrored(1)
     strike = capsule((0, 0, 0.78), (0, 0, 0.93), 0.025) | sphere(0.05).at(z=0.93)
     red = rgb("c5463a")
     return [
@@ -313,7 +314,7 @@ def clock(v: Variation) -> list[Part]:
         Part("face", face, rgb("faf5e8"), paints=(Paint("numbers", marks, rgb("3a3a3c")),)),
         Part("hands", hands | sphere(0.04).at(0.16, 0, 0.45), rgb("2b2b2d")),
         Part("bells", bell, rgb("d9b34e"), "accent"),
-        Part("hammer", strike, rgb("d9b34e"), "accent"),
+        Part("hammer", strike | posts, rgb("d9b34e"), "accent"),
         Part("feet", feet, rgb("d9b34e"), "accent"),
     ]
 

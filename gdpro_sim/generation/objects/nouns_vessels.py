@@ -44,7 +44,7 @@ def cup(v: Variation) -> list[Part]:
     saucer = revolve([(0.0, 0.0), (0.26, 0.0), (0.5, 0.09), (0.5, 0.125), (0.24, 0.05), (0.0, 0.05)])
     saucer = saucer.rounded(0.012).at(z=0.012)
     handle = loop_handle(0.86 * radius, 0.2, 0.9 * height + 0.03, 0.17, 0.032).rz(90)
-    tea = cylinder(0.9 * radius, 0.18).at(z=0.8 * height - 0.12).within(cavity.rounded(0.01))
+    tea = cylinder(0.9 * radius, 0.8 * height).at(z=0.06).within(cavity.rounded(0.01))
     return [
         Part("saucer", saucer, rgb("f1ece0"), "main"),
         Part("cup", hollow(outline, 0.035, 0.05).at(z=0.07), rgb("f1ece0"), "main"),
@@ -391,10 +391,9 @@ def watering_can(v: Variation) -> list[Part]:
 @noun("basket", "wicker basket", "picnic basket", kind="vessels", across=0.4, material="wood")
 def basket(v: Variation) -> list[Part]:
     height = v(0.36)
-    body = cone(0.3, 0.38, height) - cone(0.26, 0.335, height).at(z=0.05)
-    body = body.bumpy(0.012, wave(22, 0.0)).stretched(y=1.25)
+    body = cone(0.3, 0.38, height).bumpy(0.012, wave(22, 0.0)).stretched(y=1.25)
     rim = torus(0.37, 0.032).stretched(y=1.25).at(z=height)
-    cloth = ellipsoid(0.36, 0.45, 0.09).at(z=height - 0.03).bumpy(0.015, wave(5, v.uniform(0, 6)))
+    cloth = ellipsoid(0.36, 0.45, 0.11).at(z=height - 0.03).bumpy(0.015, wave(5, v.uniform(0, 6)))
     return [
         Part("body", body, rgb("c0924f"), "main", "weave", rgb("94682f")),
         Part("rim", rim, rgb("9d6d33"), "main"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -101,12 +102,17 @@ class Noun:
 
     def part_names(self) -> list[str]:
         """Names a prompt may colour, paints included, in order."""
-        names: dict[str, None] = {}
-        for part in self.parts(0):
-            names[part.name] = None
-            for paint in part.paints:
-                names[paint.name] = None
-        return list(names)
+        return list(_part_names(self))
+
+
+@cache
+def _part_names(noun: Noun) -> tuple[str, ...]:
+    names: dict[str, None] = {}
+    for part in noun.parts(0):
+        names[part.name] = None
+        for paint in part.paints:
+            names[paint.name] = None
+    return tuple(names)
 
 
 NOUNS: dict[str, Noun] = {}
