@@ -127,7 +127,9 @@ def generate(
     height: Annotated[float | None, typer.Option("--height", min=1e-4, help="Height in m.")] = None,
     material: Annotated[str | None, typer.Option("--material", help="Physical preset of the asset.")] = None,
     color: Color = None,
-    up: Annotated[str, typer.Option("--up", help="Up axis of a mesh file: auto, y or z.")] = "auto",
+    up: Annotated[
+        str, typer.Option("--up", help="Up axis of the input: auto, y, z; photos and splats also x, -x ...")
+    ] = "auto",
     background: Annotated[
         str | None, typer.Option("--background", help="white or black: colour key of photos without alpha.")
     ] = None,
@@ -151,7 +153,8 @@ def generate(
     if output is None:
         raise RequestError("give the asset to write: -o NAME.usdc")
     check_suffix(output, (".usdc", ".usda", ".usdz"))
-    check_choice("--up", up, ("auto", "y", "z"))
+    axes = ("auto", "y", "z") if from_mesh is not None else ("auto", "x", "y", "z", "-x", "-y", "-z")
+    check_choice("--up", up, axes)
     for path in (from_mesh, from_images, from_splat, config):
         if path is not None:
             check_exists(path)
@@ -172,6 +175,9 @@ def generate(
         if from_mesh or from_images or from_splat:
             base["guidance"]["kind"] = "views"
             base["prior"]["kind"] = "hull" if from_images else "mesh"
+        if from_splat:  # real scenes are finer than a single object of the vocabulary
+            base["extraction"] = {"depth": 9, "triangles": 12_000}
+            base["refinement"] = {"per_triangle": 6}
         for part, name, value in (
             ("guidance", "kind", guidance),
             ("guidance", "model", model),

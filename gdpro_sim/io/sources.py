@@ -178,7 +178,8 @@ def _from_photos(inputs: Inputs, config: GenerationConfig, seed: int, device: st
     from gdpro_sim.io.photos import read_photos
 
     path = Path(inputs.images or "")
-    scene = read_photos(path, background=inputs.background, up=inputs.up)
+    seen = config.refinement.resolution // config.refinement.supersample
+    scene = read_photos(path, background=inputs.background, up=inputs.up, largest=max(512, 2 * seen))
     guidance = PhotoGuidance(scene.photos, config.guidance, device=device)
     frame = UnitFrame((0.0, 0.0, 0.0), 1.0)  # photos and hull are in the unit frame already
     prior, make = _prior(inputs, config, seed, device, photos=scene.photos, frame=frame)
