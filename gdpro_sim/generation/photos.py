@@ -108,6 +108,24 @@ class Photos:
         view, k = (torch.tensor(a[index : index + 1], dtype=torch.float32) for a in (self.viewmats, self.Ks))
         return Cameras(view, k, width, height)
 
+    def box(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """The part of a photo that may show the unit sphere: corners (x, y), pixels; empty where none does.
+
+        The photos must be in the unit frame.
+        """
+        height, width = self.pictures[index].shape[:2]
+        view, k = self.viewmats[index], self.Ks[index]
+        size = np.array([width, height], np.float64)
+        z = view[2, 3]
+        if z < -1.0:  # behind the camera
+            return np.zeros(2), np.zeros(2)
+        if z <= MARGIN:  # the camera is beside or within the sphere: everything may show it
+            return np.zeros(2), size
+        focal = np.array([k[0, 0], k[1, 1]])
+        middle = focal * view[:2, 3] / z + k[:2, 2]
+        reach = MARGIN * focal / np.sqrt(z * z - 1.0)
+        return np.clip(middle - reach, 0.0, size), np.clip(middle + reach, 0.0, size)
+
     def square(self, index: int, where: np.ndarray) -> tuple[np.ndarray, float]:
         """A square of a photo around the unit sphere: corner (x, y) and side, pixels; never beyond the photo.
 
@@ -115,20 +133,11 @@ class Photos:
         other way round). The photos must be in the unit frame.
         """
         height, width = self.pictures[index].shape[:2]
-        view, k = self.viewmats[index], self.Ks[index]
-        size = np.array([width, height], np.float64)
-        z = view[2, 3]
-        if z <= MARGIN:  # within the sphere: everything may show the object
-            low, high = np.zeros(2), size
-        else:
-            focal = np.array([k[0, 0], k[1, 1]])
-            middle = focal * view[:2, 3] / z + k[:2, 2]
-            reach = MARGIN * focal / np.sqrt(z * z - 1.0)
-            low, high = np.clip(middle - reach, 0.0, size), np.clip(middle + reach, 0.0, size)
+        low, high = self.box(index)
         side = float(min(max((high - low).max(), 1.0), width, height))
         slack = high - low - side
         corner = np.where(slack > 0.0, low + np.asarray(where) * slack, low + 0.5 * slack)
-        return np.clip(corner, 0.0, size - side), side
+        return np.clip(corner, 0.0, np.array([width, height]) - side), side
 
     def views(self, which: Sequence[int], where: np.ndarray, resolution: tuple[int, int]) -> Cameras:
         """Cameras of squares of the photos `which` [B], at `resolution` (width, height); see `square`."""

@@ -14,7 +14,7 @@ import warp as wp
 
 from gdpro_sim.binding import face_normals, vertex_normals
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.device import launch_chunked, resolve_device, thread_count
+from gdpro_sim.device import beside_torch, launch_chunked, resolve_device, thread_count
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.generation.protocols import ImageKind
 from gdpro_sim.kernels import rasterize, raycast
@@ -101,6 +101,7 @@ class MeshRenderer:
         cutout = any(m.cutout and m.texture is not None for m in mesh.materials)
         self._opaque = bool((colors[:, 3] == 1.0).all()) and not (cutout and mesh.uv is not None)
         self._reach = float(np.linalg.norm(mesh.vertices, axis=1).max())
+        wp.synchronize_device(self.device)  # pictures may be drawn on another stream
 
     def render(self, cameras: Cameras, rays: int = 2) -> Renders:
         """Pictures from C cameras, each pixel the mean of `rays` x `rays` samples."""
@@ -119,10 +120,11 @@ class MeshRenderer:
             None if normals is None else wp.from_torch(normals.view(-1, 3), dtype=wp.vec3),
         ]
         outside = float(cameras.positions.norm(dim=1).min()) > self._reach + CLEAR
-        if self.device == "cpu" and self._opaque and outside:
-            self._rasterize(cameras, rays, outputs)
-        else:
-            self._cast(cameras, rays, outputs)
+        with beside_torch(rgb):
+            if self.device == "cpu" and self._opaque and outside:
+                self._rasterize(cameras, rays, outputs)
+            else:
+                self._cast(cameras, rays, outputs)
         if normals is not None:
             normals = torch.nn.functional.normalize(normals, dim=-1)
         return Renders(cameras, rgb, alphas, depths, normals)

@@ -18,6 +18,7 @@ from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.surface import MeshMaterial, SurfaceMesh
 from gdpro_sim.splatting import rasterization
+from tests.conditions import needs_gpu
 from tests.meshing import shapes
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
@@ -214,6 +215,17 @@ def test_corner_normals_are_round_on_a_sphere_and_flat_on_a_cube() -> None:
     v, f = shapes.cube()
     flat = corner_normals(SurfaceMesh.from_arrays(v, f))
     assert np.allclose(np.abs(flat).max(2), 1.0)
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_cuda_draws_what_the_cpu_draws() -> None:
+    mesh, cameras = coloured(*shapes.sphere(3, 0.9)), held_out(2, 48)
+    cpu = MeshRenderer(mesh, normals=True).render(cameras)
+    gpu = MeshRenderer(mesh, device="cuda", normals=True).render(cameras)
+    for name in ("rgb", "alphas", "depths", "normals"):
+        apart = (getattr(gpu, name).cpu() - getattr(cpu, name)).abs().amax(-1)
+        assert float((apart > 1e-3).float().mean()) < 0.004, name
 
 
 def test_over_a_background_and_as_an_image() -> None:

@@ -110,6 +110,21 @@ def test_a_view_of_a_photo_is_what_its_camera_sees(photos: Photos) -> None:
     assert torch.allclose(views.azimuths, torch.atan2(eyes[:, 1], eyes[:, 0]), atol=1e-6)
 
 
+def test_photos_that_do_not_show_the_object_are_never_drawn(photos: Photos) -> None:
+    empty = np.zeros_like(photos.pictures[2])
+    views = photos.viewmats.copy()
+    views[5, 0, 3] += 50.0  # the object is far out of the picture
+    known = replace(photos, viewmats=views, pictures=(*photos.pictures[:2], empty, *photos.pictures[3:]))
+    guidance = PhotoGuidance(known)
+    assert guidance.useful == [0, 1, 3, 4, 6, 7]
+    drawn = guidance.views(proposed(12), torch.Generator().manual_seed(0)).cameras.viewmats
+    gone = torch.tensor(known.viewmats[[2, 5]], dtype=torch.float32)
+    assert not (drawn[:, None] == gone).all((2, 3)).any()
+    assert guidance.describe()["photos"] == 6
+    with pytest.raises(GuidanceError, match="no photo shows the object"):
+        PhotoGuidance(replace(photos, pictures=(empty,) * 8))
+
+
 def test_disparity_is_never_asked_of_photos(photos: Photos) -> None:
     guidance = PhotoGuidance(photos)
     views = guidance.views(replace(proposed(2), kind="disparity"), torch.Generator())

@@ -22,6 +22,9 @@ from gdpro_sim.generation.protocols import ViewBatch
 from gdpro_sim.generation.renders import GaussianRenderer, MeshRenderer, Renders
 from gdpro_sim.meshing.surface import SurfaceMesh
 
+SMALLEST = 8.0
+"""Pixels: photos in which the unit sphere is smaller show nothing worth learning."""
+
 
 class Renderer(Protocol):
     """Draws something in the unit frame from any camera."""
@@ -110,13 +113,19 @@ class PhotoGuidance(ClosedFormScore):
         config = config or GuidanceConfig()
         super().__init__(kernel_width=config.kernel_width, jitter=config.jitter, device=device)
         self.photos = photos
+        self.useful = [i for i in range(len(photos)) if _shows(photos, i)]
+        if not self.useful:
+            raise GuidanceError(
+                "no photo shows the object: check that cameras, masks and photos belong together"
+            )
 
     def views(self, proposed: ViewBatch, generator: torch.Generator) -> ViewBatch:
         """As many views of photos drawn at random, none twice before all came; colours, never disparity."""
         count = len(proposed.cameras)
         which: list[int] = []
         while len(which) < count:
-            which += torch.randperm(len(self.photos), generator=generator).tolist()
+            order = torch.randperm(len(self.useful), generator=generator).tolist()
+            which += [self.useful[i] for i in order]
         where = torch.rand(count, 2, generator=generator, dtype=torch.float64).numpy()
         size = (proposed.cameras.width, proposed.cameras.height)
         chosen = view_batch(self.photos.views(which[:count], where, size), proposed.backgrounds)
@@ -133,10 +142,16 @@ class PhotoGuidance(ClosedFormScore):
             "kind": "views",
             "of": "photos",
             "label": "fitted to the given photos at their own cameras; sides that no photo shows are free",
-            "photos": len(self.photos),
+            "photos": len(self.useful),
             "kernel_width": self.kernel_width,
             "jitter": self.jitter,
         }
+
+
+def _shows(photos: Photos, index: int) -> bool:
+    """Something of the object is in the photo, and not only a few pixels across."""
+    low, high = photos.box(index)
+    return bool((high - low).min() >= SMALLEST and (photos.pictures[index][..., 3] > 127).any())
 
 
 __all__ = ["MeshGuidance", "PhotoGuidance", "RenderedGuidance", "SplatGuidance"]
