@@ -19,7 +19,7 @@ from gdpro_sim.generation.objects.spec import ObjectSpec, Style
 from gdpro_sim.meshing.repair import face_components, signed_volume
 from gdpro_sim.meshing.surface import MeshMaterial, SurfaceMesh
 
-PROBE = 72
+PROBE = 60
 """Cells of the surface that an object's extent is measured on."""
 
 
@@ -169,7 +169,9 @@ class ParametricObject:
         return _combined(self.parts, p)
 
     def _grown(self, by: float) -> Field:
-        return lambda p: self._field(p) - np.float32(by)
+        """The field thickened by `by`, but not below the base."""
+        base = np.float32(self.offset[2])
+        return lambda p: np.maximum(self._field(p) - np.float32(by), base - p[2]) if by else self._field(p)
 
     @cached_property
     def _box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -196,12 +198,12 @@ class ParametricObject:
         return best
 
     def _holds(self, vertices: np.ndarray, faces: np.ndarray, step: float) -> bool:
-        """The surface is near every point of the probe: nothing thin was lost."""
+        """The surface is near the points of the probe (a third of them): nothing thin was lost."""
         from scipy.spatial import cKDTree
 
         if not len(faces):
             return False
-        distance, _ = cKDTree(vertices).query(self.probe, distance_upper_bound=2.0 * step)
+        distance, _ = cKDTree(vertices).query(self.probe[::3], distance_upper_bound=2.0 * step)
         return bool(np.isfinite(distance).mean() > 0.995)
 
     @cached_property
@@ -265,19 +267,30 @@ class ParametricObject:
 
 
 def _combined(parts: tuple[Part, ...], p: np.ndarray) -> np.ndarray:
+    """The union of all parts; a part is asked only where its box is nearer than what there is already."""
     out = parts[0].shape.distance(p)
     for part in parts[1:]:
-        d = part.shape.distance(p)
-        out = smooth_min(out, d, part.blend) if part.blend > 0.0 else np.minimum(out, d)
+        near = np.flatnonzero(part.shape.box_distance(p) < out + np.float32(part.blend))
+        if len(near):
+            d = part.shape.distance(np.ascontiguousarray(p[:, near]))
+            before = out[near]
+            out[near] = smooth_min(before, d, part.blend) if part.blend > 0.0 else np.minimum(before, d)
     return out
 
 
 def _nearest(parts: tuple[Part, ...], p: np.ndarray) -> np.ndarray:
     """Index of the part with the smallest distance, the first of equals; [N]."""
-    out = np.empty(p.shape[1], np.int64)
+    out = np.zeros(p.shape[1], np.int64)
     for start in range(0, p.shape[1], CHUNK):
         some = np.ascontiguousarray(p[:, start : start + CHUNK])
-        out[start : start + CHUNK] = np.argmin([part.shape.distance(some) for part in parts], axis=0)
+        index, least = out[start : start + CHUNK], parts[0].shape.distance(some)
+        for i, part in enumerate(parts[1:], 1):
+            near = np.flatnonzero(part.shape.box_distance(some) < least)
+            if len(near):
+                d = part.shape.distance(np.ascontiguousarray(some[:, near]))
+                closer = d < least[near]
+                index[near[closer]] = i
+                least[near[closer]] = d[closer]
     return out
 
 

@@ -110,8 +110,9 @@ def _missing(cells: np.ndarray, inside: np.ndarray, taken: np.ndarray) -> np.nda
             neighbour = cells[:, over].copy()
             neighbour[axis] += 2 * side - 1
             neighbour = neighbour[:, (neighbour[axis] >= 0) & (neighbour[axis] < taken.shape[axis])]
-            found.append(neighbour[:, ~taken[tuple(neighbour)]])
-    return np.unique(np.concatenate(found, axis=1), axis=1)
+            neighbour = neighbour[:, ~taken[tuple(neighbour)]]
+            found.append(np.ravel_multi_index(tuple(neighbour), taken.shape))
+    return np.stack(np.unravel_index(np.unique(np.concatenate(found)), taken.shape))
 
 
 @cache

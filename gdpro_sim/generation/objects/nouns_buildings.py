@@ -80,8 +80,8 @@ def tower(v: Variation) -> list[Part]:
     slits = arched(0.06, 0.12, 0.5).at(0.1, 0, 0.34) | arched(0.06, 0.12, 0.5).at(0.1, 0, 0.52)
     ports = arched(0.05, 0.075, 0.1).at(1.3 * radius, 0, 0.67).ring(8)
     door = arched(0.12, 0.17, 0.05).at(1.19 * radius, 0, 0.0)
-    flag = tube([(0, 0, 1.08), (0, 0, 1.22)], 0.013)
-    pennant = front_view([(0.0, 1.22), (0.0, 1.14), (0.13, 1.18)], 0.024)
+    flag = tube([(0, 0, 1.05), (0, 0, 1.21)], 0.022)
+    pennant = front_view([(0.0, 1.22), (0.0, 1.12), (0.15, 1.17)], 0.04)
     return [
         Part(
             "walls",

@@ -271,7 +271,7 @@ def chess_pawn(v: Variation) -> list[Part]:
         )
     )
     collar = ellipsoid(0.19, 0.19, 0.045).at(z=0.64)
-    felt = cylinder(0.265, 0.05, 0.02)
+    felt = cylinder(0.3, 0.06, 0.02)
     return [
         Part("body", base, rgb("e8d2a6"), "main"),
         Part("collar", collar, rgb("e8d2a6"), "main"),

@@ -29,6 +29,14 @@ class Shape:
     low: Vec
     high: Vec
 
+    def box_distance(self, p: np.ndarray) -> np.ndarray:
+        """Distance [N] to the box around the shape, 0 inside it: never more than to the shape itself."""
+        out = np.zeros(p.shape[1], _F)
+        for row, low, high in zip(p, self.low, self.high, strict=True):
+            outside = np.maximum(np.maximum(_F(low) - row, row - _F(high)), _F(0))
+            out += outside * outside
+        return np.sqrt(out)
+
     def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Shape:
         """Moved by (x, y, z)."""
         shift = np.asarray([[x], [y], [z]], _F)
@@ -128,7 +136,8 @@ class Shape:
     def blend(self, other: Shape, radius: float) -> Shape:
         """Smooth union over about `radius`."""
         k = float(radius)
-        bounds = _box(np.asarray([self.low, other.low, self.high, other.high]))
+        low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
+        bounds = _box(np.stack([low - 0.25 * k, high + 0.25 * k]))
         return Shape(lambda p: smooth_min(self.distance(p), other.distance(p), k), *bounds)
 
     def cut(self, other: Shape, radius: float = 0.0) -> Shape:
