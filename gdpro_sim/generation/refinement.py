@@ -85,7 +85,7 @@ class RefinementStage:
         b = self._start
         self._descent = MeshDescent(b.faces, len(b.vertices), c.smoothing if c.mode == "bound" else 0.0)
         self._binding = TriangleBinding(b.faces, b.face_ids, b.barycentrics, len(b.vertices))
-        self._textured = TexturedMesh(mesh, device) if textured else None
+        self._textured = TexturedMesh(mesh, device, 2 if c.supersample == 1 else 1) if textured else None
         leaves = self._leaves(start)
         rates = {
             "vertices": (c.lr_vertex, c.lr_vertex_final),

@@ -11,17 +11,15 @@ from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.surface import SurfaceMesh
 
-RAYS = 2
-"""Rays across and down a pixel."""
-
 
 class TexturedMesh:
-    """Draws a mesh that stays, in vertex colours that learn.
+    """Draws a mesh that stays, in vertex colours that learn; each pixel the mean of `rays` x `rays` rays.
 
     `start`: [V, 3] the mesh's own colours at its vertices (the mean over a vertex's corners), on `device`.
     """
 
-    def __init__(self, mesh: SurfaceMesh, device: torch.device) -> None:
+    def __init__(self, mesh: SurfaceMesh, device: torch.device, rays: int) -> None:
+        self._rays = rays
         self._index = SurfaceIndex(mesh.vertices, mesh.faces)
         self._vertices = mesh.vertices
         self._faces = mesh.faces
@@ -36,9 +34,9 @@ class TexturedMesh:
 
     def render(self, colors: torch.Tensor, cameras: Cameras, backgrounds: torch.Tensor) -> Shot:
         """Images over `backgrounds` [C, 3]; gradients reach `colors` [V, 3] alone."""
-        width, height, device = cameras.width, cameras.height, colors.device
-        across = (np.arange(width * RAYS) + 0.5) / RAYS
-        down = (np.arange(height * RAYS) + 0.5) / RAYS
+        width, height, device, count = cameras.width, cameras.height, colors.device, self._rays
+        across = (np.arange(width * count) + 0.5) / count
+        down = (np.arange(height * count) + 0.5) / count
         pixels = np.stack([*np.meshgrid(across, down), np.ones((len(down), len(across)))], -1).reshape(-1, 3)
         images, depths, alphas = [], [], []
         for c, eye in enumerate(cameras.positions.cpu().double().numpy()):
@@ -56,16 +54,16 @@ class TexturedMesh:
             shown = (corner_colors * torch.from_numpy(weight[hit]).to(device)[:, :, None]).sum(1)
             at = torch.from_numpy(hit).to(device)
             image = backgrounds[c].expand(len(rays), 3).index_copy(0, at, shown)
-            images.append(_reduced(image, height, width))
-            z, alpha = _reduced(torch.from_numpy(values).to(device), height, width).split(1, dim=2)
+            images.append(_mean(image, height, width, count))
+            z, alpha = _mean(torch.from_numpy(values).to(device), height, width, count).split(1, dim=2)
             depths.append(z / alpha.clamp(min=1e-6))
             alphas.append(alpha)
         return Shot(cameras, torch.stack(images), torch.stack(depths), torch.stack(alphas))
 
 
-def _reduced(rays: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """Mean over each pixel's rays: [H R W R, D] -> [H, W, D]."""
-    return rays.view(height, RAYS, width, RAYS, -1).mean((1, 3))
+def _mean(rays: torch.Tensor, height: int, width: int, count: int) -> torch.Tensor:
+    """Mean over each pixel's rays: [H count W count, D] -> [H, W, D]."""
+    return rays.view(height, count, width, count, -1).mean((1, 3))
 
 
-__all__ = ["RAYS", "TexturedMesh"]
+__all__ = ["TexturedMesh"]
