@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.cameras import Cameras
+from gdpro_sim.device import beside_torch
 from gdpro_sim.errors import MeshError
 from gdpro_sim.gaussians import Gaussians, Surfels, rotation_matrices
 from gdpro_sim.generation.config import ExtractionConfig
@@ -137,7 +138,8 @@ def oriented_points(gaussians: Gaussians | Surfels, config: ExtractionConfig) ->
     if not len(gaussians):
         raise MeshError("nothing opaque is seen: there are no Gaussians")
     gather = {"rendered-depth": _depth_points, "level-set": _level_points, "centres": _centre_points}
-    found = gather[config.points](gaussians, config)
+    with beside_torch(gaussians.means):
+        found = gather[config.points](gaussians, config)
     inside = np.isfinite(found.points).all(1) & np.isfinite(found.normals).all(1)
     inside &= np.linalg.norm(found.points, axis=1) < REACH
     found = found[inside]
