@@ -260,11 +260,16 @@ def test_gaussians_are_drawn_over_black() -> None:
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(300, 4).contiguous()
     g = Gaussians(means, quats, torch.full((300, 3), 0.05), torch.full((300,), 0.8), sh)
     cameras = ring(2, 48)
-    seen = GaussianRenderer(g).render(cameras)
+    seen = GaussianRenderer(g).render(cameras, rays=1)
     arguments = (means, quats, g.scales, g.opacities, sh, cameras.viewmats, cameras.Ks, 48, 48)
     backgrounds = torch.tensor([[1.0, 0.5, 0.0]] * 2)
     image, alphas, _ = rasterization(*arguments, sh_degree=0, backgrounds=backgrounds)
     assert torch.allclose(seen.over(backgrounds), image, atol=1e-5)
     assert torch.equal(seen.alphas, alphas)
     assert float(seen.depths[alphas == 0].abs().max()) == 0.0
+    finer = Cameras(cameras.viewmats, cameras.Ks * torch.tensor([2.0, 2.0, 1.0])[:, None], 96, 96)
+    reduced = (
+        GaussianRenderer(g).render(finer, rays=1).over(backgrounds).view(2, 48, 2, 48, 2, 3).mean((2, 4))
+    )
+    assert torch.allclose(GaussianRenderer(g).render(cameras).over(backgrounds), reduced, atol=1e-5)
     assert 3.5 < float(seen.depths[alphas > 0.5].min()) < float(seen.depths.max()) < 6.5
