@@ -270,7 +270,7 @@ def _combined(parts: tuple[Part, ...], p: np.ndarray) -> np.ndarray:
     """The union of all parts; a part is asked only where its box is nearer than what there is already."""
     out = parts[0].shape.distance(p)
     for part in parts[1:]:
-        near = np.flatnonzero(part.shape.box_distance(p) < out + np.float32(part.blend))
+        near = np.flatnonzero(part.shape.box_distance(p) <= out + np.float32(part.blend) + np.float32(1e-6))
         if len(near):
             d = part.shape.distance(np.ascontiguousarray(p[:, near]))
             before = out[near]

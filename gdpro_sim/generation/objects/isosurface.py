@@ -90,7 +90,7 @@ def _node_values(
         found = evaluate(field, origin[:, None] + place * step)
         # A node on the surface would give faces without area.
         least = np.float32(1e-3 * step)
-        found = np.where(np.abs(found) < least, np.where(found < 0, -least, least), found)
+        found = np.where(np.abs(found) < least, np.where(found <= 0, -least, least), found)
         rim = ((place == 0) | (place == shape[:, None])).any(0)
         flat[index] = np.where(rim, np.maximum(found, least), found)
         inside = flat[corner] < 0
