@@ -15,7 +15,7 @@ from tests.generation import tiny_pipeline
 from tests.test_cli import gdpro
 
 SMALL = [
-    "guidance.resolution=64", "prior.resolution=24", "surfels.iterations=6", "surfels.initial=800",
+    "guidance.resolution=64", "prior.resolution=24", "surfels.iterations=30", "surfels.initial=800",
     "surfels.resolution=64", "extraction.cameras=12", "extraction.resolution=96", "extraction.depth=5",
     "extraction.triangles=500", "refinement.iterations=3", "refinement.resolution=64",
     "refinement.per_triangle=3", "output.turntable_views=0",
@@ -37,7 +37,7 @@ def test_a_prompt_becomes_an_asset(tmp_path: Path) -> None:
 
 def test_progress_names_every_stage(tmp_path: Path) -> None:
     done = gdpro("generate", "a red mug", "-o", "mug.usdc", *SETTINGS, cwd=tmp_path)
-    for words in ("Prior", "Stage 1", "6/6", "Extraction", "Stage 2", "3/3", "dB"):
+    for words in ("Prior", "Stage 1", "30/30", "Extraction", "Stage 2", "3/3", "dB"):
         assert words in done.stderr, words
     assert "not text-to-3D" in " ".join(done.stdout.replace("│", " ").split())
 
