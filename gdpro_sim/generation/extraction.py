@@ -28,7 +28,6 @@ from gdpro_sim.errors import MeshError
 from gdpro_sim.gaussians import Gaussians, Surfels, rotation_matrices
 from gdpro_sim.generation.config import ExtractionConfig
 from gdpro_sim.generation.level_set import Density
-from gdpro_sim.generation.protocols import UnitFrame
 from gdpro_sim.meshing.color import linear_to_srgb, srgb_to_linear
 from gdpro_sim.meshing.remesh import decimate
 from gdpro_sim.meshing.repair import check_arrays, clean, face_areas, face_components, validate, weld
@@ -107,27 +106,6 @@ def extract(gaussians: Gaussians | Surfels, config: ExtractionConfig | None = No
         (MeshMaterial("extracted", (1.0, 1.0, 1.0, 1.0)),),
         messages=(f"surface of {len(gaussians):,} Gaussians from {len(points):,} points", *notes),
     )
-
-
-def unit_frame(gaussians: Gaussians | Surfels, *, share: float = 0.98) -> UnitFrame:
-    """Where the bulk of a cloud lies: the median centre, and the radius around it that holds `share` of the
-    opacity. A few strays far away do not move it. Raises MeshError where nothing is opaque.
-    """
-    opacity = gaussians.opacities.detach().double().cpu().numpy()
-    means = gaussians.means.detach().double().cpu().numpy()
-    usable = np.isfinite(means).all(1) & np.isfinite(opacity) & (opacity > 0.1)
-    if not usable.any():
-        raise MeshError("none of the Gaussians is opaque (opacity above 0.1): there is no object to frame")
-    means, opacity = means[usable], opacity[usable]
-    centre = np.array([_quantile(means[:, k], opacity, 0.5) for k in range(3)])
-    for _ in range(2):  # the middle of what lies within reach, rather than of where most Gaussians are
-        radius = _quantile(np.linalg.norm(means - centre, axis=1), opacity, share)
-        near = np.linalg.norm(means - centre, axis=1) <= radius
-        centre = 0.5 * (means[near].min(0) + means[near].max(0))
-    radius = _quantile(np.linalg.norm(means - centre, axis=1), opacity, share)
-    if not radius > 0.0:
-        raise MeshError(f"all {len(means)} opaque Gaussians lie at one point: they have no surface")
-    return UnitFrame((float(centre[0]), float(centre[1]), float(centre[2])), float(radius))
 
 
 def oriented_points(gaussians: Gaussians | Surfels, config: ExtractionConfig) -> OrientedPoints:
@@ -537,18 +515,10 @@ def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
-def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """Smallest value up to which `share` of the weight lies."""
-    order = np.argsort(values, kind="stable")
-    sums = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(sums, share * sums[-1])])
-
-
 __all__ = [
     "OrientedPoints",
     "extract",
     "oriented_points",
     "reconstruct",
-    "unit_frame",
     "vertex_colors",
 ]

@@ -21,7 +21,6 @@ from gdpro_sim.generation.extraction import (
     extract,
     oriented_points,
     reconstruct,
-    unit_frame,
 )
 from gdpro_sim.generation.level_set import Density
 from gdpro_sim.meshing.proximity import SurfaceIndex
@@ -224,16 +223,6 @@ def test_strays_and_an_open_ground_leave_one_closed_object() -> None:
     assert np.quantile(np.linalg.norm(apart, axis=1), 0.75) < 0.02
 
 
-def test_unit_frame_ignores_strays() -> None:
-    ball = gaussians_of("sphere")
-    moved = replace(ball, means=3.0 * ball.means + torch.tensor([5.0, 1.0, -2.0]))
-    far = replace(ball, means=200.0 * ball.means)
-    few = Gaussians(*(getattr(far, name)[:40] for name in ("means", "quats", "scales", "opacities", "sh")))
-    frame = unit_frame(Gaussians.concatenate([moved, few]))
-    assert frame.centre == pytest.approx((5.0, 1.0, -2.0), abs=0.05)
-    assert frame.radius == pytest.approx(2.7, rel=0.03)
-
-
 def test_errors_name_the_way_out() -> None:
     ball = gaussians_of("sphere")
     with pytest.raises(MeshError, match="nothing opaque"):
@@ -241,8 +230,6 @@ def test_errors_name_the_way_out() -> None:
     none = Gaussians(*(getattr(ball, n)[:0] for n in ("means", "quats", "scales", "opacities", "sh")))
     with pytest.raises(MeshError, match="nothing opaque"):
         extract(none, QUICK)
-    with pytest.raises(MeshError, match="none of the Gaussians is opaque"):
-        unit_frame(none)
     few = Gaussians(*(getattr(ball, n)[:30] for n in ("means", "quats", "scales", "opacities", "sh")))
     with pytest.raises(MeshError, match=r"only \d+ surface points"):
         extract(few, replace_config(points="centres"))
