@@ -163,7 +163,7 @@ class SurfelConfig(_Part):
     initial_opacity: float = Field(default=0.1, gt=0.0, lt=1.0, description="(code: 0.1)")
     lr_position: float = Field(default=1e-3, gt=0.0, description="Adam, first step (paper: 1.6e-5 x extent)")
     lr_position_final: float = Field(default=1e-4, gt=0.0, description="Adam, last step (log decay)")
-    lr_color: float = Field(default=2e-2, gt=0.0, description="(paper: 5e-3)")
+    lr_color: float = Field(default=4e-2, gt=0.0, description="(paper: 5e-3)")
     lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
     lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2)")
     lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
@@ -188,7 +188,7 @@ class SurfelConfig(_Part):
     densify_until: int = Field(default=230, ge=0, description="last iteration (code: 2500)")
     densify_every: int = Field(default=30, ge=1, description="(code: 100)")
     densify_gradient: float = Field(
-        default=0.5, gt=0.0, description="view-space position gradient, NDC (code: 2e-4)"
+        default=0.25, gt=0.0, description="view-space position gradient, NDC (code: 2e-4)"
     )
     split_factor: float = Field(
         default=1.6, gt=1.0, description="a split one's scale is divided by this (code: 1.6)"
@@ -241,7 +241,7 @@ class RefinementConfig(_Part):
     lr_color: float = Field(default=4e-2, gt=0.0, description="(paper: 5e-3)")
     lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
     lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2; code: 5e-3)")
-    lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    lr_scale: float = Field(default=2e-2, gt=0.0, description="(paper: 5e-4)")
     lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
     lr_last: float = Field(
         default=0.1, gt=0.0, le=1.0, description="last over first rate of all but positions (paper: 1)"

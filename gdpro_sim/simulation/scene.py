@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib.resources
 import importlib.util
+import logging
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -19,6 +20,12 @@ Vector = tuple[
     Annotated[float, Field(allow_inf_nan=False)],
     Annotated[float, Field(allow_inf_nan=False)],
 ]
+
+
+log = logging.getLogger(__name__)
+
+STIFFEST = 1.0e7
+"""Young's modulus in Pa to which `drop_scene` limits materials."""
 
 
 class _Strict(BaseModel):
@@ -205,18 +212,29 @@ def scene_names() -> list[str]:
 def drop_scene(asset: str | Path) -> Scene:
     """The default scene of one asset file: it falls from half its size, a little tilted.
 
-    Raises AssetError for a file that cannot be read, SceneError for one that is no asset.
+    A stiffer material than `STIFFEST` is taken as that stiff, and said so: no bending would be seen, and the
+    solver would spend its time on vibrations that nobody sees either. Raises AssetError for a file that cannot be read, SceneError for one that is no asset.
     """
     from gdpro_sim.asset import Asset, kind
 
     path = Path(asset).expanduser().resolve()
     if kind(path) != "asset":
         raise SceneError(f"{path} is no asset; make one of it: gdpro import {path} -o {path.stem}_asset.usdc")
-    height = 0.5 * max(Asset.load(path).summary()["size"])
-    body = {"asset": str(path), "position": (0.0, 0.0, height), "rotation": (8.0, -6.0, 20.0)}
+    loaded = Asset.load(path)
+    height = 0.5 * max(loaded.summary()["size"])
+    body: dict[str, Any] = {
+        "asset": str(path),
+        "position": (0.0, 0.0, height),
+        "rotation": (8.0, -6.0, 20.0),
+    }
+    description = "An asset falls on the floor."
+    if loaded.material is not None and loaded.material.young > STIFFEST:
+        body["material"] = {**loaded.material.model_dump(), "young": STIFFEST}
+        description += f" Young's modulus {loaded.material.young:g} Pa is taken as {STIFFEST:g} Pa."
+        log.warning("%s: %s", path.name, description.split(". ")[1])
     data = {
         "name": path.stem,
-        "description": "An asset falls on the floor.",
+        "description": description,
         "bodies": [body],
         "solver": {"substeps": 4},
         "duration": 1.5,

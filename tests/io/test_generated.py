@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,9 @@ from gdpro_sim.errors import SceneError
 from gdpro_sim.generation.config import GenerationConfig, load_config
 from gdpro_sim.io import generated
 from gdpro_sim.io.record import record
+from gdpro_sim.materials import Material
 from gdpro_sim.simulation.run import simulate
-from gdpro_sim.simulation.scene import check_scene, drop_scene, load_scene
+from gdpro_sim.simulation.scene import STIFFEST, check_scene, drop_scene, load_scene
 from tests.generation.test_pipeline import SMALL
 
 BODY = {"name": "apple", "prompt": "a green apple", "quality": "draft", "tets": 200, "position": [0, 0, 0.02]}
@@ -72,5 +74,11 @@ def test_an_asset_gets_the_default_scene(tmp_path: Path) -> None:
     assert drop == drop_scene(path)
     size = max(Asset.load(path).summary()["size"])
     assert drop.bodies[0].position[2] == pytest.approx(0.5 * size)
+    assert drop.bodies[0].material is None, "soft enough as it is"
+    stiff = replace(Asset.load(path), material=Material.model_validate({"preset": "steel"}))
+    stiff.save(tmp_path / "stiff.usdc")
+    hard = drop_scene(tmp_path / "stiff.usdc")
+    assert hard.bodies[0].material is not None and hard.bodies[0].material.young == STIFFEST
+    assert hard.bodies[0].material.density == 7850.0 and "taken as 1e+07 Pa" in hard.description
     with pytest.raises(SceneError, match="gdpro import"):
         drop_scene(Path(__import__("warp").__file__).parent / "examples/assets/cube.usd")
