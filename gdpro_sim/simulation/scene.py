@@ -213,7 +213,8 @@ def drop_scene(asset: str | Path) -> Scene:
     """The default scene of one asset file: it falls from half its size, a little tilted.
 
     A stiffer material than `STIFFEST` is taken as that stiff, and said so: no bending would be seen, and the
-    solver would spend its time on vibrations that nobody sees either. Raises AssetError for a file that cannot be read, SceneError for one that is no asset.
+    solver would spend its time on vibrations that nobody sees either. Raises AssetError for a file that
+    cannot be read, SceneError for one that is no asset.
     """
     from gdpro_sim.asset import Asset, kind
 
