@@ -29,6 +29,10 @@ def color_value(words: str) -> w.Color:
     return w.shaded(w.COLORS[name], w.SHADES[shade[0]] if shade else 0.0)
 
 
+SMOOTHING = 6
+"""Steps of smoothing of the coarse surface."""
+
+
 @dataclass(frozen=True)
 class Look:
     """How one part is coloured: a base, and a second colour where `pattern` says so."""
@@ -140,12 +144,13 @@ class ParametricObject:
     def surface(self, resolution: int, *, detail: bool = True) -> SurfaceMesh:
         """Closed coloured surface of one piece in metres, `resolution` cells across its longest side.
 
-        detail=False is the deliberately coarse one: each part in its plain base colour. Parts too thin for
-        the cells are thickened a little. Raises `MeshError` for fewer than 8 cells.
+        detail=False is the deliberately coarse one: it knows of each node of the grid only whether it lies
+        inside, and each part's plain base colour. Parts too thin for the cells are thickened a little.
+        Raises `MeshError` for fewer than 8 cells.
         """
         if resolution < 8:
             raise MeshError(f"resolution must be at least 8 cells, got {resolution}")
-        vertices, faces = self._closed(resolution)
+        vertices, faces = self._closed(resolution, occupancy=not detail)
         vertices = (vertices.astype(np.float64) - self.offset) * self.scale
         vertices = vertices.astype(np.float32)
         colors = np.full((len(vertices), 4), 255, np.uint8)
@@ -180,14 +185,22 @@ class ParametricObject:
         slack = 0.5 * float((high - low).max()) / PROBE
         return low - slack, high + slack
 
-    def _closed(self, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-        """The largest piece, thickened where cells are too coarse for it to be one piece."""
+    def _closed(self, resolution: int, *, occupancy: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The largest piece, thickened where cells are too coarse for it to be one piece.
+
+        occupancy: of inside and outside alone, which gives steps, with the steps smoothed
+        """
         low, high = self._box
         step = float((high - low).max()) / resolution
         best = None
         for grow in (0.0, 0.2, 0.4, 0.6):
-            vertices, faces = isosurface(self._grown(grow * step), low, high, resolution)
+            field = self._grown(grow * step)
+            if occupancy:
+                field = _sides(field, step)
+            vertices, faces = isosurface(field, low, high, resolution)
             vertices, faces, whole = largest_piece(vertices, faces)
+            if occupancy:
+                vertices = _smoothed(vertices, faces)
             if best is None:
                 best = vertices, faces
             if whole and self._holds(vertices, faces, step):
@@ -264,6 +277,23 @@ class ParametricObject:
             normals = self._normals(self.parts[index].shape.distance, p)
             weight = WEIGHTS[style.pattern](q, normals, self.seed)[:, None]
         return base + (second - base) * weight.astype(np.float32)
+
+
+def _sides(field: Field, step: float) -> Field:
+    """A field that only says on which side of the surface a point lies."""
+
+    def sides(p: np.ndarray) -> np.ndarray:
+        return np.where(field(p) <= 0.0, -0.5 * step, 0.5 * step).astype(np.float32)
+
+    return sides
+
+
+def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertices after a few steps of Taubin's smoothing, which does not shrink (SIGGRAPH 1995)."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return np.asarray(trimesh.smoothing.filter_taubin(mesh, iterations=SMOOTHING).vertices, np.float32)
 
 
 def _combined(parts: tuple[Part, ...], p: np.ndarray) -> np.ndarray:
