@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gdpro_sim.errors import SceneError
+from gdpro_sim.generation import objects
 from gdpro_sim.materials import PRESETS, Material
 from gdpro_sim.simulation.scene import Scene, check_scene, load_scene, scene_names
 
@@ -25,7 +26,10 @@ def test_shipped_scenes_load_and_their_assets_exist() -> None:
         scene = load_scene(name)
         assert scene.name == name and scene.description
         for body in scene.bodies:
-            assert scene.resolve(body.asset).is_file(), body.asset
+            if body.prompt is None:
+                assert scene.resolve(body.asset).is_file(), body.asset
+            else:
+                assert objects.parse(body.prompt).noun
 
 
 def test_defaults_and_relative_paths(tmp_path: Path) -> None:
