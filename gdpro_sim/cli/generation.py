@@ -222,6 +222,11 @@ def generate(
             ("Gaussians", f"{summary['gaussians']:,} on {summary['faces']:,} triangles"),
             ("seconds", "  ".join(f"{part} {value:.1f}" for part, value in result.seconds.items())),
         ]
+        psnr = [made["stages"].get(name, {}).get("psnr") for name in ("surfels", "refinement")]
+        if psnr[1] is not None:
+            against = "built-in prior" if made["guidance"].get("kind") == "procedural" else "input"
+            first = "" if psnr[0] is None else f"{psnr[0]:.1f} dB after stage 1, "
+            rows.insert(2, (f"fidelity to the {against}", f"{first}{psnr[1]:.1f} dB after stage 2"))
         if folder is not None:
             rows.append(("run", str(folder)))
         table(f"Asset {output}", rows)

@@ -7,6 +7,7 @@ Every stage is also a function or class of its own (`priors`, `surfels.SurfelSta
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,8 +20,11 @@ from gdpro_sim.asset import Asset, tetrahedralize_asset, versions
 from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.errors import GuidanceError, RequestError
 from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.generation.cameras import held_out, view_batch
 from gdpro_sim.generation.config import GenerationConfig
+from gdpro_sim.generation.evaluation import render
 from gdpro_sim.generation.extraction import extract
+from gdpro_sim.generation.guidance.views import RenderedGuidance
 from gdpro_sim.generation.protocols import CoarseMesh, Guidance, Stage, StepReport, UnitFrame
 from gdpro_sim.generation.refinement import RefinementStage
 from gdpro_sim.generation.surfels import SurfelStage
@@ -123,7 +127,11 @@ def run(
         watcher.finished("prior", mesh, figures["prior"])
         first = SurfelStage(mesh, source.guidance, config, seed)
         run_stage(first, kept, watcher, config.output.checkpoint_every)
-        figures["surfels"] = {"iterations": first.iteration, "gaussians": len(first.gaussians())}
+        figures["surfels"] = {
+            "iterations": first.iteration,
+            "gaussians": len(first.gaussians()),
+            "psnr": held_out_psnr(source.guidance, first.gaussians()),
+        }
         watcher.finished("surfels", first.gaussians(), figures["surfels"])
         cloud: Any = first.result()
     else:
@@ -137,10 +145,27 @@ def run(
     second = RefinementStage(basic, source.guidance, config, seed)
     run_stage(second, kept, watcher, config.output.checkpoint_every)
     bound = second.result()
-    figures["refinement"] = {"iterations": second.iteration, "gaussians": len(bound)}
+    figures["refinement"] = {
+        "iterations": second.iteration,
+        "gaussians": len(bound),
+        "psnr": held_out_psnr(source.guidance, bound.gaussians()),
+    }
     watcher.finished("refinement", bound, figures["refinement"])
     watcher.phase("output")
     return _asset(source, config, seed, bound, second.vertex_colors(), frame, material, knows_size, figures)
+
+
+def held_out_psnr(guidance: Guidance, gaussians: Gaussians, views: int = 8, size: int = 128) -> float | None:
+    """PSNR in dB on white from cameras that no stage saw, against what `guidance` draws there.
+
+    None where the guidance draws nothing at any camera: photos, diffusion models.
+    """
+    if not isinstance(guidance, RenderedGuidance):
+        return None
+    white = torch.ones(views, 3)
+    batch = view_batch(held_out(views, size), white)
+    with torch.no_grad():
+        return round(guidance.psnr(render(gaussians, batch.cameras).over(white), batch), 2)
 
 
 def run_stage(stage: Stage, store: Store, observer: Observer, every: int) -> None:
@@ -164,8 +189,6 @@ def run_stage(stage: Stage, store: Store, observer: Observer, every: int) -> Non
 
 
 def _prior(make: Callable[[], CoarseMesh], store: Store) -> CoarseMesh:
-    import json
-
     found = store.load("prior")
     if found is None:
         coarse = make()
@@ -259,4 +282,4 @@ def _asset(
     return asset
 
 
-__all__ = ["Observer", "Source", "Store", "pack_mesh", "run", "run_stage", "unpack_mesh"]
+__all__ = ["Observer", "Source", "Store", "held_out_psnr", "pack_mesh", "run", "run_stage", "unpack_mesh"]

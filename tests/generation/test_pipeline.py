@@ -121,6 +121,8 @@ def test_provenance_says_how_it_was_made(whole: tuple[Asset, Stopper]) -> None:
     assert "not text-to-3D" in made["guidance"]["label"]
     assert made["config"]["surfels"]["iterations"] == 24
     assert made["stages"]["refinement"]["gaussians"] == len(whole[0].gaussians)
+    assert 8.0 < made["stages"]["surfels"]["psnr"] < 60.0
+    assert 8.0 < made["stages"]["refinement"]["psnr"] < 60.0
     assert {"gdpro-sim", "torch", "warp-lang"} <= set(made["versions"])
     assert whole[0].material is not None
 
