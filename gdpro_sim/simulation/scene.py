@@ -6,6 +6,7 @@ import difflib
 import importlib.resources
 import importlib.util
 import logging
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -222,7 +223,8 @@ def drop_scene(asset: str | Path) -> Scene:
     if kind(path) != "asset":
         raise SceneError(f"{path} is no asset; make one of it: gdpro import {path} -o {path.stem}_asset.usdc")
     loaded = Asset.load(path)
-    height = 0.5 * max(loaded.summary()["size"])
+    size = max(loaded.summary()["size"])
+    height = 0.5 * size
     body: dict[str, Any] = {
         "asset": str(path),
         "position": (0.0, 0.0, height),
@@ -238,7 +240,7 @@ def drop_scene(asset: str | Path) -> Scene:
         "description": description,
         "bodies": [body],
         "solver": {"substeps": 4},
-        "duration": 1.5,
+        "duration": max(1.5, round(4.0 * math.sqrt(size / 9.81), 1)),  # the fall takes a quarter of it
     }
     return check_scene(data, str(path))
 
