@@ -114,6 +114,8 @@ def run(
         )
     kept, watcher = store or _Memory(), observer or Observer()
     figures: dict[str, Any] = {}
+    # at the size the refined Gaussians are made for: smaller pictures blur them
+    size = min(config.refinement.resolution // config.refinement.supersample, 256)
     frame, material, knows_size = source.frame, None, True
     if source.splat is None:
         if source.prior is None:
@@ -130,7 +132,7 @@ def run(
         figures["surfels"] = {
             "iterations": first.iteration,
             "gaussians": len(first.gaussians()),
-            "psnr": held_out_psnr(source.guidance, first.gaussians()),
+            "psnr": held_out_psnr(source.guidance, first.gaussians(), size),
         }
         watcher.finished("surfels", first.gaussians(), figures["surfels"])
         cloud: Any = first.result()
@@ -148,17 +150,17 @@ def run(
     figures["refinement"] = {
         "iterations": second.iteration,
         "gaussians": len(bound),
-        "psnr": held_out_psnr(source.guidance, bound.gaussians()),
+        "psnr": held_out_psnr(source.guidance, bound.gaussians(), size),
     }
     watcher.finished("refinement", bound, figures["refinement"])
     watcher.phase("output")
     return _asset(source, config, seed, bound, second.vertex_colors(), frame, material, knows_size, figures)
 
 
-def held_out_psnr(guidance: Guidance, gaussians: Gaussians, views: int = 8, size: int = 128) -> float | None:
+def held_out_psnr(guidance: Guidance, gaussians: Gaussians, size: int, views: int = 8) -> float | None:
     """PSNR in dB on white from cameras that no stage saw, against what `guidance` draws there.
 
-    None where the guidance draws nothing at any camera: photos, diffusion models.
+    size: pixels across the pictures. None where the guidance draws nothing at any camera: photos, diffusion models.
     """
     if not isinstance(guidance, RenderedGuidance):
         return None
