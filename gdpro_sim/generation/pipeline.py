@@ -160,7 +160,8 @@ def run(
 def held_out_psnr(guidance: Guidance, gaussians: Gaussians, size: int, views: int = 8) -> float | None:
     """PSNR in dB on white from cameras that no stage saw, against what `guidance` draws there.
 
-    size: pixels across the pictures. None where the guidance draws nothing at any camera: photos, diffusion models.
+    size: pixels across the pictures. None where the guidance draws nothing at any camera: photos, diffusion
+    models.
     """
     if not isinstance(guidance, RenderedGuidance):
         return None
