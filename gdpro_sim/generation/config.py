@@ -144,18 +144,33 @@ class CameraConfig(_Part):
     )
 
 
-class SurfelConfig(_Part):
+class StageConfig(_Part):
+    """What both stages have in common."""
+
+    batch: int = Field(default=2, ge=1, description="views an iteration (paper: 4)")
+    supersample: int = Field(
+        default=2, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
+    )
+    lr_color: float = Field(default=4e-2, gt=0.0, description="(paper: 5e-3)")
+    lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
+    lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2; code of stage 2: 5e-3)")
+    lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
+    lr_last: float = Field(
+        default=0.1, gt=0.0, le=1.0, description="last over first rate of all but positions (paper: 1)"
+    )
+    sh_degree: int = Field(
+        default=0, ge=0, le=3, description="highest SH degree (paper: 3, in stage 2 0; code: 3)"
+    )
+
+
+class SurfelConfig(StageConfig):
     """Stage 1."""
 
     kind: Literal["surfels", "gaussians"] = Field(
         default="surfels", description="2D surfels (paper) or 3D Gaussians"
     )
     iterations: int = Field(default=350, ge=0, description="(paper: 5000)")
-    batch: int = Field(default=2, ge=1, description="views an iteration (paper: 4)")
     resolution: int = Field(default=256, ge=16, description="pixels across a rendered view (paper: 1024)")
-    supersample: int = Field(
-        default=2, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
-    )
     initial: int = Field(
         default=6000, ge=16, description="surfels at the start (paper: the prior's vertices)"
     )
@@ -163,15 +178,7 @@ class SurfelConfig(_Part):
     initial_opacity: float = Field(default=0.1, gt=0.0, lt=1.0, description="(code: 0.1)")
     lr_position: float = Field(default=1e-3, gt=0.0, description="Adam, first step (paper: 1.6e-5 x extent)")
     lr_position_final: float = Field(default=1e-4, gt=0.0, description="Adam, last step (log decay)")
-    lr_color: float = Field(default=4e-2, gt=0.0, description="(paper: 5e-3)")
-    lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
-    lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2)")
     lr_scale: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
-    lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
-    lr_last: float = Field(
-        default=0.1, gt=0.0, le=1.0, description="last over first rate of all but positions (paper: 1)"
-    )
-    sh_degree: int = Field(default=0, ge=0, le=3, description="highest SH degree (paper: 3)")
     sh_every: int = Field(default=500, ge=1, description="iterations between degrees (code: 500)")
     tv: float = Field(
         default=0.0, ge=0.0, description="weight of total variation of colour and depth (paper: 10)"
@@ -219,33 +226,21 @@ class ExtractionConfig(_Part):
     triangles: int = Field(default=6000, ge=20, description="target count of stage 2's mesh (code: 40000)")
 
 
-class RefinementConfig(_Part):
+class RefinementConfig(StageConfig):
     """Stage 2."""
 
     mode: Literal["bound", "frozen", "unbound", "textured-mesh"] = Field(
         default="bound", description="bound; others ablate"
     )
     iterations: int = Field(default=250, ge=0, description="(paper: 5000)")
-    batch: int = Field(default=2, ge=1, description="views an iteration (paper: 4)")
     resolution: int = Field(default=384, ge=16, description="pixels across a rendered view (paper: 1024)")
-    supersample: int = Field(
-        default=2, ge=1, le=4, description="views are reduced by this before guidance (paper: 2)"
-    )
     per_triangle: int = Field(
         default=10, ge=1, description="Gaussians on a triangle: 1, 3, 4, 6, 10, ... (code: 55)"
     )
     initial_opacity: float = Field(default=0.7, gt=0.0, lt=1.0, description="(paper: 0.7)")
-    sh_degree: int = Field(default=0, ge=0, le=3, description="(paper: 0; code: 3)")
     lr_vertex: float = Field(default=2e-3, gt=0.0, description="Adam, first step (paper: 1.6e-4 x extent)")
     lr_vertex_final: float = Field(default=2e-4, gt=0.0, description="Adam, last step (log decay)")
-    lr_color: float = Field(default=4e-2, gt=0.0, description="(paper: 5e-3)")
-    lr_sh: float = Field(default=1e-3, gt=0.0, description="higher SH bands (code: 2.5e-4)")
-    lr_opacity: float = Field(default=5e-2, gt=0.0, description="(paper: 5e-2; code: 5e-3)")
     lr_scale: float = Field(default=2e-2, gt=0.0, description="(paper: 5e-4)")
-    lr_rotation: float = Field(default=1e-2, gt=0.0, description="(paper: 5e-4)")
-    lr_last: float = Field(
-        default=0.1, gt=0.0, le=1.0, description="last over first rate of all but positions (paper: 1)"
-    )
     smoothing: float = Field(
         default=3.0, ge=0.0, description="lambda of vertex steps (1 + lambda L)^-1, Large Steps (paper: 0)"
     )
@@ -461,6 +456,7 @@ __all__ = [
     "PriorConfig",
     "RefinementConfig",
     "ScoreConfig",
+    "StageConfig",
     "SurfelConfig",
     "load_config",
 ]

@@ -12,8 +12,8 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.generation.cameras import Background, CameraSchedule
-from gdpro_sim.generation.config import GenerationConfig
+from gdpro_sim.generation.cameras import CameraSchedule
+from gdpro_sim.generation.config import GenerationConfig, RefinementConfig, SurfelConfig
 from gdpro_sim.generation.guidance.closed_form import ClosedFormScore
 from gdpro_sim.generation.ism import ScoreDistillation
 from gdpro_sim.generation.protocols import Guidance, ViewBatch, step_generator
@@ -57,7 +57,8 @@ class Clock:
 class Distillation:
     """Score distillation for one stage: chooses views, reduces pictures, asks the guidance.
 
-    resolution: pixels across a rendered view; the guidance sees it reduced by `supersample`
+    part: the stage's own configuration; its `resolution` is that of a rendered view, which the guidance sees
+    reduced by `supersample`
     """
 
     def __init__(
@@ -65,19 +66,13 @@ class Distillation:
         stage: str,
         guidance: Guidance,
         config: GenerationConfig,
+        part: SurfelConfig | RefinementConfig,
         seed: int,
-        *,
-        iterations: int,
-        batch: int,
-        resolution: int,
-        supersample: int,
-        background: Background,
     ) -> None:
         self.stage, self.guidance, self.seed = stage, guidance, seed
-        self.iterations, self.batch, self.supersample = iterations, batch, supersample
-        self.background: Background = background
+        self.iterations, self.batch, self.supersample = part.iterations, part.batch, part.supersample
         self.score = ScoreDistillation(guidance, config.score)
-        self.schedule = CameraSchedule(config.cameras, max(1, resolution // supersample))
+        self.schedule = CameraSchedule(config.cameras, max(1, part.resolution // part.supersample))
         self.depth_probability = config.score.depth_probability
 
     @property
@@ -88,9 +83,7 @@ class Distillation:
     def look(self, iteration: int) -> tuple[ViewBatch, torch.Generator]:
         """Views of this iteration as the guidance sees them, and the iteration's random numbers."""
         generator = step_generator(self.seed, self.stage, iteration)
-        views = self.schedule.sample(
-            iteration, self.iterations, self.batch, generator, background=self.background
-        )
+        views = self.schedule.sample(iteration, self.iterations, self.batch, generator, background="mixed")
         if float(torch.rand((), generator=generator)) < self.depth_probability:
             views = replace(views, kind="disparity")
         return self.guidance.views(views, generator), generator
@@ -160,9 +153,44 @@ def variation(shot: Shot) -> torch.Tensor:
     return losses.total_variation(shot.rgb) + losses.total_variation(grey)
 
 
+def rates(part: SurfelConfig | RefinementConfig) -> dict[str, tuple[float, float]]:
+    """Learning rates, at the first and the last step, of what both stages learn."""
+
+    def calming(rate: float) -> tuple[float, float]:
+        return rate, rate * part.lr_last
+
+    return {
+        "quats": calming(part.lr_rotation),
+        "log_scales": calming(part.lr_scale),
+        "logits": (part.lr_opacity,) * 2,  # has far to go, and saturates
+        "dc": calming(part.lr_color),
+        "rest": calming(part.lr_sh),
+    }
+
+
+def harmonics(leaves: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Spherical harmonics [N, K, 3] of leaves `dc` and, above degree 0, `rest`."""
+    return torch.cat([leaves["dc"], leaves["rest"]], 1) if "rest" in leaves else leaves["dc"]
+
+
+def flat(parts: Mapping[str, Mapping[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+    """Nested states as one: entry NAME of part PREFIX as `PREFIX.NAME`."""
+    return {f"{part}.{k}": v for part, entries in parts.items() for k, v in entries.items()}
+
+
 def nested(state: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Entries `prefix.NAME` of a flat state as `NAME`."""
     return {k.removeprefix(f"{prefix}."): v for k, v in state.items() if k.startswith(f"{prefix}.")}
 
 
-__all__ = ["Clock", "Distillation", "Shot", "nested", "reduced", "variation"]
+__all__ = [
+    "Clock",
+    "Distillation",
+    "Shot",
+    "flat",
+    "harmonics",
+    "nested",
+    "rates",
+    "reduced",
+    "variation",
+]

@@ -21,7 +21,16 @@ from gdpro_sim.device import beside_torch
 from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.gaussians import SH_C0, Gaussians, Surfels, rgb_to_sh, sh_to_rgb
 from gdpro_sim.generation.config import GenerationConfig, RefinementConfig
-from gdpro_sim.generation.distillation import Clock, Distillation, Shot, nested, variation
+from gdpro_sim.generation.distillation import (
+    Clock,
+    Distillation,
+    Shot,
+    flat,
+    harmonics,
+    nested,
+    rates,
+    variation,
+)
 from gdpro_sim.generation.mesh_descent import MeshDescent
 from gdpro_sim.generation.optimizer import Adam
 from gdpro_sim.generation.protocols import Guidance, StepReport
@@ -69,17 +78,7 @@ class RefinementStage:
             config = config.model_copy(
                 update={"score": config.score.model_copy(update={"depth_probability": 0.0})}
             )
-        self._distillation = Distillation(
-            self.name,
-            guidance,
-            config,
-            seed,
-            iterations=c.iterations,
-            batch=c.batch,
-            resolution=c.resolution,
-            supersample=c.supersample,
-            background="mixed",
-        )
+        self._distillation = Distillation(self.name, guidance, config, c, seed)
         device = self._distillation.device
         self._start = bound_start(mesh, c).to(device)
         b = self._start
@@ -87,18 +86,11 @@ class RefinementStage:
         self._binding = TriangleBinding(b.faces, b.face_ids, b.barycentrics, len(b.vertices))
         self._textured = TexturedMesh(mesh, device, 2 if c.supersample == 1 else 1) if textured else None
         leaves = self._leaves(start)
-        rates = {
-            "vertices": (c.lr_vertex, c.lr_vertex_final),
-            "means": (c.lr_vertex, c.lr_vertex_final),
-            "rotations": (c.lr_rotation, c.lr_rotation * c.lr_last),
-            "quats": (c.lr_rotation, c.lr_rotation * c.lr_last),
-            "log_scales": (c.lr_scale, c.lr_scale * c.lr_last),
-            "logits": (c.lr_opacity,) * 2,  # has far to go, and saturates
-            "dc": (c.lr_color, c.lr_color * c.lr_last),
-            "rest": (c.lr_sh, c.lr_sh * c.lr_last),
-            "colors": (SH_C0 * c.lr_color, SH_C0 * c.lr_color * c.lr_last),
-        }
-        self._adam = Adam(leaves, {name: rates[name] for name in leaves})
+        own = rates(c)
+        own["vertices"] = own["means"] = (c.lr_vertex, c.lr_vertex_final)
+        own["rotations"] = own["quats"]
+        own["colors"] = (SH_C0 * own["dc"][0], SH_C0 * own["dc"][1])
+        self._adam = Adam(leaves, {name: own[name] for name in leaves})
 
     def step(self) -> StepReport:
         """One iteration: views, images, score, regularisers, Adam."""
@@ -161,7 +153,7 @@ class RefinementStage:
             rotations=a["rotations"],
             log_scales=a["log_scales"],
             opacity_logits=a["logits"],
-            sh=torch.cat([a["dc"], a["rest"]], 1) if "rest" in a else a["dc"],
+            sh=harmonics(a),
         )
 
     def gaussians(self) -> Gaussians:
@@ -174,7 +166,7 @@ class RefinementStage:
             torch.nn.functional.normalize(a["quats"], dim=1),
             a["log_scales"].exp(),
             a["logits"].sigmoid(),
-            torch.cat([a["dc"], a["rest"]], 1) if "rest" in a else a["dc"].clone(),
+            harmonics(a).clone(),
         )
 
     def vertex_colors(self) -> np.ndarray:
@@ -210,8 +202,7 @@ class RefinementStage:
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         parts = {"adam": self._adam.state_dict(), "score": self._distillation.state_dict()}
-        state = {f"{part}.{k}": v for part, entries in parts.items() for k, v in entries.items()}
-        return {"iteration": torch.tensor(self.iteration), **state}
+        return {"iteration": torch.tensor(self.iteration), **flat(parts)}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Raises KeyError or ValueError where the state is not that of such a stage."""
@@ -265,7 +256,7 @@ class RefinementStage:
             cost = cost + c.laplacian * self._descent.laplacian(a["vertices"])
         if c.scale > 0.0:
             cost = cost + c.scale * scales.mean()
-        sh = torch.cat([a["dc"], a["rest"]], 1) if "rest" in a else a["dc"]
+        sh = harmonics(a)
         image, alphas, _ = rasterization(
             means,
             quats,

@@ -20,7 +20,16 @@ from gdpro_sim.errors import MeshError
 from gdpro_sim.gaussians import Gaussians, Surfels, rgb_to_sh
 from gdpro_sim.generation.config import GenerationConfig
 from gdpro_sim.generation.densification import Densification
-from gdpro_sim.generation.distillation import Clock, Distillation, Shot, nested, variation
+from gdpro_sim.generation.distillation import (
+    Clock,
+    Distillation,
+    Shot,
+    flat,
+    harmonics,
+    nested,
+    rates,
+    variation,
+)
 from gdpro_sim.generation.optimizer import Adam
 from gdpro_sim.generation.protocols import Guidance, StepReport, step_generator
 from gdpro_sim.meshing.color import SurfaceColors
@@ -48,29 +57,12 @@ class SurfelStage:
         self.config = config.surfels
         c = self.config
         self.iterations, self.iteration = c.iterations, 0
-        self._distillation = Distillation(
-            self.name,
-            guidance,
-            config,
-            seed,
-            iterations=c.iterations,
-            batch=c.batch,
-            resolution=c.resolution,
-            supersample=c.supersample,
-            background="mixed",
-        )
+        self._distillation = Distillation(self.name, guidance, config, c, seed)
         device = self._distillation.device
         start = step_generator(seed, f"{self.name} start", 0)
         leaves = {k: v.to(device) for k, v in _leaves(mesh, config, start).items()}
-        rates = {
-            "means": (c.lr_position, c.lr_position_final),
-            "quats": (c.lr_rotation, c.lr_rotation * c.lr_last),
-            "log_scales": (c.lr_scale, c.lr_scale * c.lr_last),
-            "logits": (c.lr_opacity,) * 2,  # has far to go, and saturates
-            "dc": (c.lr_color, c.lr_color * c.lr_last),
-            "rest": (c.lr_sh, c.lr_sh * c.lr_last),
-        }
-        self._adam = Adam(leaves, {name: rates[name] for name in leaves})
+        own = {**rates(c), "means": (c.lr_position, c.lr_position_final)}
+        self._adam = Adam(leaves, {name: own[name] for name in leaves})
         self._densification = Densification(c, len(leaves["means"]), device)
 
     def step(self) -> StepReport:
@@ -116,7 +108,7 @@ class SurfelStage:
             torch.nn.functional.normalize(a["quats"], dim=1),
             a["log_scales"].exp(),
             a["logits"].sigmoid(),
-            torch.cat([a["dc"], a["rest"]], 1) if "rest" in a else a["dc"].clone(),
+            harmonics(a).clone(),
         )
 
     def gaussians(self) -> Gaussians:
@@ -130,8 +122,7 @@ class SurfelStage:
             "densification": self._densification.state_dict(),
             "score": self._distillation.state_dict(),
         }
-        state = {f"{part}.{k}": v for part, entries in parts.items() for k, v in entries.items()}
-        return {"iteration": torch.tensor(self.iteration), **state}
+        return {"iteration": torch.tensor(self.iteration), **flat(parts)}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
         """Raises KeyError or ValueError where the state is not that of such a stage."""
@@ -149,7 +140,7 @@ class SurfelStage:
         """Images, what they cost beside the score, and the rasteriser's `meta`."""
         c, a = self.config, self._adam.parameters
         degree = min(c.sh_degree, self.iteration // c.sh_every)
-        sh = torch.cat([a["dc"], a["rest"]], 1) if "rest" in a else a["dc"]
+        sh = harmonics(a)
         scene = (a["means"], a["quats"], a["log_scales"].exp(), a["logits"].sigmoid(), sh)
         view = (cameras.viewmats, cameras.Ks, cameras.width, cameras.height)
         cost = sh.new_zeros(())
