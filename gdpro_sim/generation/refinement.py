@@ -102,7 +102,8 @@ class RefinementStage:
         views, generator = self._distillation.look(self.iteration)
         with clock.part("render"):
             cameras, backgrounds = self._distillation.rendered(views)
-            shot, regularisers, count = self._render(cameras, backgrounds)
+            deep = views.kind == "disparity" or c.tv > 0.0
+            shot, regularisers, count = self._render(cameras, backgrounds, deep)
             images = self._distillation.pictures(shot, views)
         with clock.part("guidance"):
             score, psnr = self._distillation.judge(images, views, self.iteration, generator)
@@ -239,8 +240,13 @@ class RefinementStage:
         own["dc"] = sh[:, :1]
         return {**own, "rest": sh[:, 1:]} if sh.shape[1] > 1 else own
 
-    def _render(self, cameras: Cameras, backgrounds: torch.Tensor) -> tuple[Shot, torch.Tensor, int]:
-        """Images, what the shape costs beside the score, and how many Gaussians there are."""
+    def _render(
+        self, cameras: Cameras, backgrounds: torch.Tensor, deep: bool
+    ) -> tuple[Shot, torch.Tensor, int]:
+        """Images, what the shape costs beside the score, and how many Gaussians there are.
+
+        Without `deep` the depths are left out, [C, H, W, 0]: a channel less to blend.
+        """
         c, a = self.config, self._adam.parameters
         if self._textured is not None:
             return self._textured.render(a["colors"], cameras, backgrounds), backgrounds.new_zeros(()), 0
@@ -269,7 +275,7 @@ class RefinementStage:
             cameras.height,
             sh_degree=c.sh_degree,
             backgrounds=backgrounds,
-            render_mode="RGB+ED",
+            render_mode="RGB+ED" if deep else "RGB",
         )
         return Shot(cameras, image[..., :3], image[..., 3:], alphas), cost, len(means)
 

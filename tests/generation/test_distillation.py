@@ -13,17 +13,10 @@ from tests.generation.meshes import ball, small
 
 def distillation(*, depth_probability: float = 0.0, supersample: int = 2) -> Distillation:
     config = small(score={"depth_probability": depth_probability})
-    return Distillation(
-        "test",
-        MeshGuidance(ball(2)),
-        config,
-        5,
-        iterations=10,
-        batch=3,
-        resolution=32,
-        supersample=supersample,
-        background="mixed",
+    part = config.surfels.model_copy(
+        update={"iterations": 10, "batch": 3, "resolution": 32, "supersample": supersample}
     )
+    return Distillation("test", MeshGuidance(ball(2)), config, part, 5)
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3])
