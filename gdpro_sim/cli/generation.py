@@ -72,7 +72,12 @@ def live(quiet: bool) -> Iterator[Callable[[str, int, int, Mapping[str, Any]], N
                 tasks[part], completed=done, total=total or None, figures=_figures(done, total, figures)
             )
 
-        yield report
+        try:
+            yield report
+        except BaseException:
+            for task in tasks.values():  # what did not finish would stand between the user and the error
+                bars.update(task, visible=bars.tasks[task].finished)
+            raise
         close()
 
 

@@ -129,12 +129,13 @@ def run(
         watcher.finished("prior", mesh, figures["prior"])
         first = SurfelStage(mesh, source.guidance, config, seed)
         run_stage(first, kept, watcher, config.output.checkpoint_every)
+        learned = first.gaussians()
         figures["surfels"] = {
             "iterations": first.iteration,
-            "gaussians": len(first.gaussians()),
-            "psnr": held_out_psnr(source.guidance, first.gaussians(), size),
+            "gaussians": len(learned),
+            "psnr": held_out_psnr(source.guidance, learned, size),
         }
-        watcher.finished("surfels", first.gaussians(), figures["surfels"])
+        watcher.finished("surfels", learned, figures["surfels"])
         cloud: Any = first.result()
     else:
         cloud = source.splat
