@@ -252,6 +252,11 @@ class RefinementConfig(StageConfig):
     normal_consistency: float = Field(
         default=0.3, ge=0.0, description="weight over adjacent faces (code: 0.3)"
     )
+    eps2d: float = Field(
+        default=0.05,
+        ge=0.0,
+        description="screen-space dilation while learning, px^2: a wide one shrinks the mesh (code: 0.3)",
+    )
     laplacian: float = Field(
         default=0.0, ge=0.0, description="weight of the uniform Laplacian (available in code)"
     )
@@ -361,6 +366,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "lr_scale": 5e-4,
             "lr_rotation": 5e-4,
             "lr_last": 1.0,
+            "eps2d": 0.3,
             "smoothing": 0.0,
             "flatness": 1.0,
             "tv": 10.0,

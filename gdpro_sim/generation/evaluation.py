@@ -35,6 +35,10 @@ COVISIBLE = 0.03
 SAMPLES = 20_000
 """Points drawn on each surface."""
 
+DILATION = 0.05
+"""Screen-space dilation of the Gaussians that are judged, px^2: little, so that what is seen is their own
+size and not that of the picture. Viewers dilate by 0.3 px^2, in pictures of more pixels."""
+
 SUPERSAMPLE = 2
 """Gaussians are drawn this much larger and averaged down, as the stages that made them do."""
 
@@ -131,7 +135,7 @@ def render(shown: Gaussians | SurfaceMesh, cameras: Cameras) -> Renders:
         k = cameras.Ks[index : index + 1].to(g.means) * g.means.new_tensor([[s], [s], [1.0]])
         image, alpha, _ = rasterization(
             g.means, g.quats, g.scales, g.opacities, g.sh, view, k, s * cameras.width, s * cameras.height,
-            sh_degree=g.sh_degree, render_mode="RGB+D",
+            sh_degree=g.sh_degree, render_mode="RGB+D", eps2d=DILATION,
         )  # fmt: skip
         pooled = torch.nn.functional.avg_pool2d(torch.cat([image, alpha], -1).movedim(-1, 1), s)
         rgb, depth, a = pooled.movedim(1, -1).split([3, 1, 1], -1)

@@ -274,6 +274,7 @@ class RefinementStage:
             cameras.width,
             cameras.height,
             sh_degree=c.sh_degree,
+            eps2d=c.eps2d,
             backgrounds=backgrounds,
             render_mode="RGB+ED" if deep else "RGB",
         )
