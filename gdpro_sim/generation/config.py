@@ -170,7 +170,7 @@ class SurfelConfig(StageConfig):
         default="surfels", description="2D surfels (paper) or 3D Gaussians"
     )
     iterations: int = Field(default=350, ge=0, description="(paper: 5000)")
-    resolution: int = Field(default=256, ge=16, description="pixels across a rendered view (paper: 1024)")
+    resolution: int = Field(default=320, ge=16, description="pixels across a rendered view (paper: 1024)")
     initial: int = Field(
         default=6000, ge=16, description="surfels at the start (paper: the prior's vertices)"
     )

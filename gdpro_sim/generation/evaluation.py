@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.errors import RequestError
+from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.generation.cameras import held_out, ring
 from gdpro_sim.generation.renders import MeshRenderer, Renders
@@ -34,6 +34,10 @@ COVISIBLE = 0.03
 
 SAMPLES = 20_000
 """Points drawn on each surface."""
+
+OPEN = 0.1
+"""Share of the hemisphere over a point through which it must see out to count: pictures teach nothing of
+what lies deep in a gap or between the layers of a closed thing."""
 
 DILATION = 0.05
 """Screen-space dilation of the Gaussians that are judged, px^2: little, so that what is seen is their own
@@ -151,13 +155,21 @@ def surface_figures(
 
     With distances d of points drawn on one surface to the nearest of the other: Chamfer = (mean d_found +
     mean d_truth) / 2; precision and recall are the shares of d_found and d_truth within the threshold,
-    F = 2 P R / (P + R). Source: Knapitsch et al., "Tanks and Temples" (2017), section 3.2.
+    F = 2 P R / (P + R). Only points that see out (`OPEN`) are counted; they are compared with the whole of
+    the other surface. Source: Knapitsch et al., "Tanks and Temples" (2017), section 3.2; visible points
+    alone after Jensen et al., "Large Scale Multi-view Stereopsis Evaluation" (2014).
+
+    Raises MeshError where nothing of a surface sees out.
     """
     threshold = 0.01 * truth.diagonal
     apart: list[np.ndarray] = []
     angles: list[np.ndarray] = []
     for a, b in ((found, truth), (truth, found)):
         points, normals = sample(a, samples, generator)
+        out = SurfaceIndex(a.vertices, a.faces).openness(points, normals, reach=2.0 * a.diagonal) > OPEN
+        if not out.any():
+            raise MeshError(f"{a.source or 'surface'}: wound inside out, nothing of it can be seen")
+        points, normals = points[out], normals[out]
         where, weights = SurfaceIndex(b.vertices, b.faces).closest(points, normals, reach=0.05)
         corners = b.vertices.astype(np.float64)[b.faces[where]]
         apart.append(np.linalg.norm(points - np.einsum("nc,ncd->nd", weights, corners), axis=1))

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from gdpro_sim.cameras import Cameras
-from gdpro_sim.errors import RequestError
+from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.gaussians import Gaussians, rgb_to_sh
 from gdpro_sim.generation.cameras import held_out
 from gdpro_sim.generation.evaluation import (
@@ -66,6 +66,20 @@ def test_concentric_spheres_are_a_known_distance_apart() -> None:
     assert near[1] == 1.0 and near[2] < 3.0  # diagonal 2.8: 1 % is 0.028
     far = surface_figures(ball(0.80), ball(0.90), np.random.default_rng(0))
     assert far[0] == pytest.approx(0.1, rel=0.02) and far[1] == 0.0
+
+
+def test_what_no_picture_can_show_does_not_count() -> None:
+    whole, kernel = ball(0.80), ball(0.30)
+    filled = SurfaceMesh.from_arrays(
+        np.concatenate([whole.vertices, kernel.vertices]),
+        np.concatenate([whole.faces, kernel.faces + len(whole.vertices)]),
+    )
+    for pair in ((filled, whole), (whole, filled)):
+        chamfer, f_score, angle = surface_figures(*pair, np.random.default_rng(0))
+        assert chamfer == pytest.approx(0.0, abs=1e-6) and f_score == 1.0 and angle < 0.1
+    with pytest.raises(MeshError, match="inside out"):
+        inverted = SurfaceMesh.from_arrays(whole.vertices, whole.faces[:, ::-1])
+        surface_figures(inverted, whole, np.random.default_rng(0))
 
 
 def test_half_a_surface_has_full_precision_and_half_the_recall() -> None:

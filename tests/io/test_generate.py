@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -151,33 +150,32 @@ def test_from_python_without_a_folder() -> None:
 
 
 SCRIPT = """
-import sys
+import os, signal, sys
 from pathlib import Path
 from tests.io.test_generate import request
 from gdpro_sim.io.generate import generate_run
-generate_run(request(turntable_views=0), Path(sys.argv[1])).asset.save(sys.argv[2])
+folder, out, stage, iteration = sys.argv[1:]
+def kill(part, done, total, figures):
+    if part == stage and done == int(iteration):
+        os.kill(os.getpid(), signal.SIGKILL)
+generate_run(request(turntable_views=0), Path(folder), on_progress=kill).asset.save(out)
 """
 
 
 @posix_only
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    root = Path(__file__).resolve().parents[2]
-    killed, out = tmp_path / "killed", tmp_path / "killed.usdc"
-    command = [sys.executable, "-c", SCRIPT, str(killed), str(out)]
-    for wait_for in ("surfels", "refinement"):
-        process = subprocess.Popen(command, cwd=root)
-        deadline = time.monotonic() + 120
-        while not (killed / f"{wait_for}.safetensors").exists() and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    assert not out.exists() or process.returncode == 0
-    subprocess.run(command, cwd=root, check=True, timeout=300)
-    whole = [sys.executable, "-c", SCRIPT, str(tmp_path / "whole"), str(tmp_path / "whole.usdc")]
-    subprocess.run(whole, cwd=root, check=True, timeout=300)
-    assert out.read_bytes() == (tmp_path / "whole.usdc").read_bytes()
+    def start(name: str, stage: str = "", iteration: int = 0) -> int:
+        out = tmp_path / f"{name}.usdc"
+        command = [sys.executable, "-c", SCRIPT, str(tmp_path / name), str(out), stage, str(iteration)]
+        root = Path(__file__).resolve().parents[2]
+        return subprocess.run(command, cwd=root, timeout=300, check=False).returncode
+
+    assert start("killed", "surfels", 17) == -signal.SIGKILL
+    assert start("killed", "refinement", 7) == -signal.SIGKILL
+    assert not (tmp_path / "killed.usdc").exists()
+    assert start("killed") == 0 and start("whole") == 0
+    assert (tmp_path / "killed.usdc").read_bytes() == (tmp_path / "whole.usdc").read_bytes()
 
 
 LIMITED = """
