@@ -153,6 +153,9 @@ def cg_serial(
     offsets: wp.array[wp.int32],
     columns: wp.array[wp.int32],
     values: wp.array[wp.mat33d],
+    extra_offsets: wp.array[wp.int32],
+    extra_columns: wp.array[wp.int32],
+    extra_values: wp.array[wp.mat33d],
     inverse_diagonal: wp.array[wp.mat33d],
     right_hand_side: wp.array[wp.vec3d],
     # Work:
@@ -182,6 +185,7 @@ def cg_serial(
         pq = wp.float64(0.0)
         for i in range(rows):
             q = row_product(offsets[i], offsets[i + 1], columns, values, p_out)
+            q += row_product(extra_offsets[i], extra_offsets[i + 1], extra_columns, extra_values, p_out)
             q_out[i] = q
             pq += wp.dot(p_out[i], q)
         if pq <= wp.float64(0.0):
@@ -249,6 +253,9 @@ def cg_product(
     offsets: wp.array[wp.int32],
     columns: wp.array[wp.int32],
     values: wp.array[wp.mat33d],
+    extra_offsets: wp.array[wp.int32],
+    extra_columns: wp.array[wp.int32],
+    extra_values: wp.array[wp.mat33d],
     p: wp.array[wp.vec3d],
     # Out:
     q_out: wp.array[wp.vec3d],
@@ -260,6 +267,7 @@ def cg_product(
     total = wp.float64(0.0)
     for i in range(bounds[0], bounds[1]):
         q = row_product(offsets[i], offsets[i + 1], columns, values, p)
+        q += row_product(extra_offsets[i], extra_offsets[i + 1], extra_columns, extra_values, p)
         q_out[i] = q
         total += wp.dot(p[i], q)
     dots_out[block] = total

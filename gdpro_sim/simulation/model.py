@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -38,10 +38,16 @@ class Ground:
     height: float = 0.0
 
 
+Integrator = Literal["backward-euler", "bdf2", "midpoint", "quasi-static", "explicit"]
+
+
 @dataclass(frozen=True)
 class FemSettings:
     """How the FEM solver steps.
 
+    integrator:        "backward-euler" damps motion a little and is never unstable; "bdf2" and "midpoint"
+                       damp far less (midpoint where nothing touches; else it is backward Euler); "quasi-static" goes to where forces balance, without inertia;
+                       "explicit" is symplectic Euler in as many substeps as stability needs
     substeps:          implicit steps per `step(dt)`; a substep that fails is halved by the solver
     newton_iterations: most projected-Newton iterations in one substep before it counts as failed
     newton_tolerance:  stop when a full Newton step moves no vertex by more than this times dt, m/s
@@ -51,6 +57,7 @@ class FemSettings:
                        own elasticity and weight
     """
 
+    integrator: Integrator = "backward-euler"
     substeps: int = 2
     newton_iterations: int = 20
     newton_tolerance: float = 1e-3
@@ -137,4 +144,4 @@ class Solver(Protocol):
         """Figures of the last step (of the initial state before any)."""
 
 
-__all__ = ["Body", "Diagnostics", "FemSettings", "Ground", "Model", "Solver"]
+__all__ = ["Body", "Diagnostics", "FemSettings", "Ground", "Integrator", "Model", "Solver"]

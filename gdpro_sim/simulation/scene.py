@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
+from gdpro_sim.simulation.model import Integrator
 
 Vector = tuple[
     Annotated[float, Field(allow_inf_nan=False)],
@@ -145,6 +146,10 @@ class SolverOptions(_Strict):
     """Settings of the FEM solver; the defaults are converged for the shipped scenes."""
 
     kind: Literal["fem"] = "fem"
+    integrator: Integrator = Field(
+        default="backward-euler",
+        description="backward-euler; bdf2 or midpoint, which damp less; quasi-static; explicit",
+    )
     substeps: int = Field(default=2, ge=1, le=1000, description="implicit steps per frame at least")
     newton_iterations: int = Field(default=20, ge=1, le=1000, description="at most, per substep")
     newton_tolerance: float = Field(default=1e-3, gt=0.0, description="largest vertex speed correction, m/s")

@@ -9,11 +9,10 @@ import pytest
 
 from gdpro_sim.errors import SolverError
 from gdpro_sim.simulation.fem import SolverFEM
-from gdpro_sim.simulation.fem.potential import IncrementalPotential
 from gdpro_sim.simulation.fem.topology import build_topology
 from gdpro_sim.simulation.model import Body, Ground, Solver
 from tests.reference.fem import ReferenceFem
-from tests.simulation.fem_models import make_model, tet_box
+from tests.simulation.fem_models import make_model, potential_at, tet_box
 
 TIGHT = {"newton_tolerance": 1e-8, "cg_tolerance": 1e-8}
 
@@ -30,10 +29,8 @@ def test_satisfies_the_solver_protocol() -> None:
 def test_assembled_matrix_matches_the_reference() -> None:
     vertices, tets = tet_box((2, 2, 2), (0.5, 0.4, 0.3))
     model = make_model(vertices, tets, young=1e5, poisson=0.375)
-    potential = IncrementalPotential(model)
     x = model.vertices + 0.02 * np.random.default_rng(0).normal(size=vertices.shape)
-    potential.trial.assign(x)
-    potential.begin(0.01)
+    potential = potential_at(model, x, 0.01)
     potential.linearise(potential.trial)
     oracle = ReferenceFem(model.vertices, tets, 1e5, 0.375, 1000.0, model.pinned)
     expected = oracle.elastic_hessian(x, projected=True).toarray()
@@ -57,13 +54,9 @@ def test_patch_affine_deformation_has_no_interior_force() -> None:
     inside = np.all((vertices > 1e-9) & (vertices < 0.5 - 1e-9), axis=1)
     vertices[inside] += 0.02 * np.random.default_rng(0).normal(size=(int(inside.sum()), 3))
     model = make_model(vertices, tets, young=1e5, gravity=(0, 0, 0))
-    potential = IncrementalPotential(model)
     A = np.array([[1.2, 0.1, 0.0], [0.05, 0.9, -0.1], [0.0, 0.2, 1.1]])
-    potential.trial.assign(model.vertices.astype(np.float64) @ A.T)
-    wp_x = potential.trial
-    potential.x.assign(wp_x.numpy())
-    potential.begin(1.0)
-    potential.linearise(wp_x)
+    potential = potential_at(model, model.vertices.astype(np.float64) @ A.T, 1.0)
+    potential.linearise(potential.trial)
     force = np.linalg.norm(potential.system.right_hand_side.numpy(), axis=1)
     assert inside.sum() == 8
     assert force[inside].max() <= 1e-5 * force[~inside].max()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from gdpro_sim.device import run_chunks
@@ -43,6 +44,10 @@ class ConjugateGradient:
         self.offsets: wp.array = wp.array(topology.offsets, dtype=wp.int32, device=device)
         self.columns: wp.array = wp.array(topology.columns, dtype=wp.int32, device=device)
         self.values = wp.zeros(len(topology.columns), dtype=wp.mat33d, device=device)
+        self._extra_offsets = wp.zeros(self.rows + 1, dtype=wp.int32, device=device)
+        self._extra_columns = wp.zeros(0, dtype=wp.int32, device=device)
+        self._extra_values = wp.zeros(0, dtype=wp.mat33d, device=device)
+        self._coupled = False
         self.inverse_diagonal = wp.zeros(self.rows, dtype=wp.mat33d, device=device)
         self.right_hand_side, self.solution, self.residual, self._z, self._p, self._q = (
             wp.zeros(self.rows, dtype=wp.vec3d, device=device) for _ in range(6)
@@ -55,6 +60,31 @@ class ConjugateGradient:
             # Before several threads could each try to build it.
             wp.load_module(linalg, device=device)
         self._commands: dict[tuple[str, int, int], wp.Launch] = {}
+
+    def couple(self, blocks: Any | None) -> None:
+        """Add off-diagonal blocks, a symmetric scipy.sparse.bsr_matrix of 3x3 blocks over all rows, to A.
+
+        They stay until the next call; None takes them out. Memory grows with the most blocks seen.
+        """
+        if blocks is None:
+            if self._coupled:
+                self._extra_offsets.zero_()
+                self._coupled = False
+            return
+        count = len(blocks.indices)
+        if count > len(self._extra_columns):
+            self._extra_columns = wp.zeros(2 * count, dtype=wp.int32, device=self.device)
+            self._extra_values = wp.zeros(2 * count, dtype=wp.mat33d, device=self.device)
+            self._commands.clear()  # they hold the old arrays
+        self._extra_offsets.assign(np.ascontiguousarray(blocks.indptr, np.int32))
+        if count:
+            columns: wp.array = wp.array(blocks.indices.astype(np.int32), dtype=wp.int32, device=self.device)
+            values: wp.array = wp.array(
+                np.ascontiguousarray(blocks.data), dtype=wp.mat33d, device=self.device
+            )
+            wp.copy(self._extra_columns, columns, count=count)
+            wp.copy(self._extra_values, values, count=count)
+        self._coupled = True
 
     def solve(self, tolerance: float, max_iterations: int) -> SolveReport:
         """Solve until the preconditioned residual has fallen by `tolerance`, starting from zero."""
@@ -76,6 +106,9 @@ class ConjugateGradient:
                 self.offsets,
                 self.columns,
                 self.values,
+                self._extra_offsets,
+                self._extra_columns,
+                self._extra_values,
                 self.inverse_diagonal,
                 self.right_hand_side,
             ],
@@ -98,7 +131,15 @@ class ConjugateGradient:
             self._over_rows(linalg.cg_direction, [self._z, self._scalars], [self._p])
             self._over_rows(
                 linalg.cg_product,
-                [self.offsets, self.columns, self.values, self._p],
+                [
+                    self.offsets,
+                    self.columns,
+                    self.values,
+                    self._extra_offsets,
+                    self._extra_columns,
+                    self._extra_values,
+                    self._p,
+                ],
                 [self._q, self._dots],
             )
             self._scalar(linalg.cg_set_alpha)
@@ -146,12 +187,18 @@ class ConjugateGradient:
         command.launch()
 
     def matrix(self) -> Any:
-        """A as a scipy BSR matrix; on the CPU it shares the memory of `values`."""
+        """A as a scipy BSR matrix; on the CPU it shares the memory of `values` where nothing is coupled."""
         from scipy.sparse import bsr_matrix
 
         count = 3 * self.rows
         parts = (self.values.numpy(), self.columns.numpy(), self.offsets.numpy())
-        return bsr_matrix(parts, shape=(count, count), copy=False)
+        found = bsr_matrix(parts, shape=(count, count), copy=False)
+        if not self._coupled:
+            return found
+        offsets = self._extra_offsets.numpy()
+        end = int(offsets[-1])
+        parts = (self._extra_values.numpy()[:end], self._extra_columns.numpy()[:end], offsets)
+        return found + bsr_matrix(parts, shape=(count, count))
 
 
 __all__ = ["ConjugateGradient", "SolveReport"]

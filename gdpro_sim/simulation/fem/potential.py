@@ -8,30 +8,15 @@ import numpy as np
 import warp as wp
 
 from gdpro_sim.device import launch_chunked
-from gdpro_sim.errors import SolverError
-from gdpro_sim.kernels import fem, linalg
+from gdpro_sim.kernels import elements, fem, linalg
 from gdpro_sim.simulation.fem.conjugate_gradient import ConjugateGradient
+from gdpro_sim.simulation.fem.rest import RestShapes, reals
+from gdpro_sim.simulation.fem.term import Step, Term
 from gdpro_sim.simulation.fem.topology import BLOCKS_PER_ELEMENT, build_topology
 from gdpro_sim.simulation.model import Model
 
 RANGES = 128
 """Partial sums of energies and measures: fixed, so that totals do not depend on the number of threads."""
-
-CONTACT_PER_ELASTIC = 3.0
-"""Ground stiffness of a vertex as a multiple of its own elastic stiffness."""
-
-STICK_PER_ELASTIC = 1.0
-"""Friction spring stiffness of a vertex as a multiple of its own elastic stiffness. Stiffer makes the
-stick-slip kink sharper and Newton zigzag across it (ten times the iterations on a soft body, measured), and
-buys only a smaller elastic give before slipping; at 1 that give is that of one more layer of elements."""
-
-CONTACT_SAG = 1e-3
-"""Penetration, as a fraction of the body's size, at which one vertex would carry the whole body's weight."""
-
-CONTACT_RAMP = 1e-4
-"""Depth over which the ground penalty turns from cubic to quadratic, as a fraction of the body's size."""
-
-STANDARD_GRAVITY = 9.81
 
 
 class StepMeasures(NamedTuple):
@@ -42,18 +27,18 @@ class StepMeasures(NamedTuple):
 class IncrementalPotential:
     """E(x) of `gdpro_sim.kernels.fem` for one model; allocates everything once.
 
-    x, v, anchor:  [P] state at the start of the step: positions m, velocities m/s, friction anchors m
-    trial:         [P] the iterate
-    inertia:       [P] where inertia and gravity alone would take each vertex; coasting: without gravity
+    trial, start:  [P] the iterate, and where a line search starts
+    inertia, base: [P] set by the integrator: where inertia and gravity alone lead; velocities are
+                   (x - base) / h
+    terms:         contact, forces, in a fixed order
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, rest: RestShapes, terms: tuple[Term, ...]) -> None:
         self.device = model.device
         self.vertex_count = len(model.vertices)
         self.element_count = len(model.tets)
         device, p, t = self.device, self.vertex_count, self.element_count
-
-        rest = _rest_shapes(model)
+        self.terms = terms
         self.mass = rest.mass
         self.fixed = model.pinned | (rest.mass <= 0.0)
         self.energy_noise = 2.0e-16 * float(np.sum(rest.volume * (rest.lam + 2.0 * rest.mu)))
@@ -61,41 +46,31 @@ class IncrementalPotential:
         topology = build_topology(model.tets, p)
         self.system = ConjugateGradient(topology, device)
 
-        self.elements = fem.Elements()
+        self.elements = elements.Elements()
         self.elements.tets = wp.array(model.tets, dtype=wp.vec4i, device=device)
         self.elements.inverse_rest = wp.array(rest.inverse, dtype=wp.mat33d, device=device)
-        self.elements.volume = _reals(rest.volume, device)
-        self.elements.mu = _reals(rest.mu, device)
-        self.elements.lam = _reals(rest.lam, device)
-        self.elements.damping = _reals(model.rayleigh_stiffness, device)
+        self.elements.volume = reals(rest.volume, device)
+        self.elements.mu = reals(rest.mu, device)
+        self.elements.lam = reals(rest.lam, device)
+        self.elements.damping = reals(model.rayleigh_stiffness, device)
 
-        stiffness, stick, ramp = _contact_scales(model, rest)
         self.vertices = fem.Vertices()
-        self.vertices.mass = _reals(rest.mass, device)
-        self.vertices.damping = _reals(rest.mass_damping, device)
-        self.vertices.friction = _reals(model.friction, device)
-        self.vertices.contact_stiffness = _reals(stiffness, device)
-        self.vertices.stick_stiffness = _reals(stick, device)
-        self.vertices.contact_ramp = _reals(ramp, device)
-        self.vertices.contact_offset = _reals(model.contact_offset, device)
+        self.vertices.mass = reals(rest.mass, device)
+        self.vertices.damping = reals(rest.mass_damping, device)
         self.vertices.fixed = wp.array(self.fixed.astype(np.int32), dtype=wp.int32, device=device)
         self.vertices.offsets = wp.array(topology.corner_offsets, dtype=wp.int32, device=device)
         self.vertices.corners = wp.array(topology.corners, dtype=wp.int32, device=device)
 
-        self.ground = fem.Ground()
-        self.ground.enabled = int(model.ground is not None)
-        self.ground.height = model.ground.height if model.ground is not None else 0.0
-        self.gravity = wp.vec3d(*model.gravity)
-
-        self.x, self.v, self.trial, self.base, self.inertia, self.coasting = (
+        self.trial, self.start, self.inertia, self.base, self.gradient, self._difference = (
             wp.zeros(p, dtype=wp.vec3d, device=device) for _ in range(6)
         )
-        self.anchor = wp.zeros(p, dtype=wp.vec2d, device=device)
-        self._limit = wp.zeros(p, dtype=wp.float64, device=device)
+        self._block = wp.zeros(p, dtype=wp.mat33d, device=device)
         self._cauchy_green = wp.zeros(t, dtype=wp.mat33d, device=device)
-        self._element_gradient = wp.zeros(4 * t, dtype=wp.vec3d, device=device)
+        self.element_gradient = wp.zeros(4 * t, dtype=wp.vec3d, device=device)
         self._element_blocks = wp.zeros(BLOCKS_PER_ELEMENT * t, dtype=wp.mat33d, device=device)
-        self._terms = wp.zeros(t + p, dtype=wp.float64, device=device)
+        self._energies = wp.zeros(
+            t + p + sum(term.energies for term in terms), dtype=wp.float64, device=device
+        )
         self._sums, self._maxima = (wp.zeros(RANGES, dtype=wp.float64, device=device) for _ in range(2))
         self._diagonal: wp.array = wp.array(topology.diagonal, dtype=wp.int32, device=device)
         self._pairs: list[wp.array] = [
@@ -107,58 +82,52 @@ class IncrementalPotential:
         ]
         self._pair_count = len(topology.upper)
         self._damped = bool(np.any(model.rayleigh_stiffness > 0.0))
-        self._inverse_dt = 0.0
+        self._inverse_h = 0.0
 
-    def begin(self, dt: float) -> None:
-        """Start a step of `dt` seconds from (x, v, anchor)."""
-        self._inverse_dt = 1.0 / dt
-        self._over_vertices(
-            fem.predict,
-            [self.vertices, self.x, self.v, self.gravity, dt],
-            [self.inertia, self.coasting],
-        )
+    def begin(self, step: Step) -> None:
+        """Start a solve; then the integrator sets `inertia`, `base` and `strain_base`, and terms `step.held`.
+
+        Fixed vertices of `inertia` are to be put where they are held after that.
+        """
+        self._inverse_h = 1.0 / step.h
+        for term in self.terms:
+            term.begin(step)
+
+    def strain_base(self, a: wp.array, weight_a: float, b: wp.array, weight_b: float) -> None:
+        """Measure strain rates from weight_a C(a) + weight_b C(b), C = F^T F."""
         if self._damped:
-            self._over_elements(fem.element_cauchy_green, [self.elements, self.x], [self._cauchy_green])
+            inputs = [self.elements, a, weight_a, b, weight_b]
+            self.over_elements(elements.element_cauchy_green, inputs, [self._cauchy_green])
 
-    def update_friction(self, x: wp.array) -> None:
-        """Take the Coulomb limits from the normal forces at x; they stay until the next call."""
-        self._over_vertices(fem.friction_limits, [self.vertices, self.ground, x], [self._limit])
+    def lag(self, x: wp.array) -> None:
+        """Take from x what the terms hold fixed for a while."""
+        for term in self.terms:
+            term.lag(x)
 
     def energy(self, x: wp.array, *, elements_unchanged: bool = False) -> float:
         """E(x) in J; infinite if an element is inverted.
 
-        `elements_unchanged` reuses the element terms of the last call (when only friction limits changed).
+        `elements_unchanged` reuses the element terms of the last call (when only lagged values changed).
         """
         if not elements_unchanged:
-            self._over_elements(
-                fem.element_energy,
-                [self.elements, x, self._cauchy_green, self._inverse_dt],
-                [self._terms],
-            )
-        self._over_vertices(
-            fem.vertex_energy,
-            [
-                self.element_count,
-                self.vertices,
-                self.ground,
-                x,
-                self.x,
-                self.inertia,
-                self.anchor,
-                self._limit,
-                self._inverse_dt,
-            ],
-            [self._terms],
-        )
-        return self._total(self._terms)
+            inputs = [self.elements, x, self._cauchy_green, self._inverse_h]
+            self.over_elements(elements.element_energy, inputs, [self._energies])
+        first = self.element_count
+        inputs = [first, self.vertices, x, self.base, self.inertia, self._inverse_h]
+        self.over_vertices(fem.vertex_energy, inputs, [self._energies])
+        first += self.vertex_count
+        for term in self.terms:
+            term.energy(x, self._energies, first)
+            first += term.energies
+        return self._total(self._energies)
 
     def linearise(self, x: wp.array) -> None:
         """Fill the linear system H d = -gradient at x."""
         system = self.system
-        self._over_elements(
-            fem.element_derivatives,
-            [self.elements, x, self._cauchy_green, self._inverse_dt],
-            [self._element_gradient, self._element_blocks],
+        self.over_elements(
+            elements.element_derivatives,
+            [self.elements, x, self._cauchy_green, self._inverse_h],
+            [self.element_gradient, self._element_blocks],
         )
         launch_chunked(
             linalg.gather_off_diagonal,
@@ -167,23 +136,39 @@ class IncrementalPotential:
             [system.values],
             device=self.device,
         )
-        self._over_vertices(
+        system.couple(self._add_terms(x))
+        self.over_vertices(
             fem.assemble_vertices,
             [
                 self.vertices,
-                self.ground,
                 x,
-                self.x,
+                self.base,
                 self.inertia,
-                self.anchor,
-                self._limit,
-                self._inverse_dt,
-                self._element_gradient,
+                self._inverse_h,
+                self.element_gradient,
                 self._element_blocks,
+                self.gradient,
+                self._block,
                 self._diagonal,
             ],
             [system.right_hand_side, system.values, system.inverse_diagonal],
         )
+
+    def forces(self, x: wp.array) -> None:
+        """Gradients of elements and terms at x, without inertia, into element_gradient and gradient."""
+        inputs = [self.elements, x, self._cauchy_green, self._inverse_h]
+        self.over_elements(elements.element_gradient, inputs, [self.element_gradient])
+        self._add_terms(x)
+
+    def _add_terms(self, x: wp.array) -> Any:
+        self.gradient.zero_()
+        self._block.zero_()
+        couplings = None
+        for term in self.terms:
+            found = term.add_derivatives(x, self.gradient, self._block)
+            if found is not None:
+                couplings = found if couplings is None else couplings + found
+        return couplings
 
     def largest_acceleration(self) -> float:
         """Largest |gradient_i| / m_i, m/s^2, of the last `linearise`."""
@@ -208,37 +193,39 @@ class IncrementalPotential:
         return StepMeasures(float(self._sums.numpy().sum()), float(np.sqrt(self._maxima.numpy().max())))
 
     def move_trial(self, length: float) -> None:
-        """trial = base + length * (the system's solution)."""
-        self._over_vertices(fem.move, [self.base, self.system.solution, length], [self.trial])
+        """trial = start + length * (the system's solution)."""
+        self.combine(self.start, 1.0, self.system.solution, length, self.trial)
 
-    def accept(self) -> None:
-        """Make the trial the state: new velocities, positions and friction anchors."""
-        self._over_vertices(
-            fem.finish,
-            [self.vertices, self.ground, self.trial, self._inverse_dt],
-            [self.x, self.v, self.anchor],
-        )
+    def combine(
+        self, a: wp.array, weight_a: float, b: wp.array, weight_b: float, out: wp.array, constant: Any = None
+    ) -> None:
+        """out = weight_a a + weight_b b + constant, [P] vec3d; `out` may be `a` or `b`."""
+        inputs = [a, weight_a, b, weight_b, wp.vec3d() if constant is None else constant]
+        self.over_vertices(fem.combine, inputs, [out])
 
-    def elastic_energy(self) -> float:
+    def hold(self, held: wp.array, out: wp.array) -> None:
+        """Put fixed vertices where they are held."""
+        self.over_vertices(fem.hold, [self.vertices, held], [out])
+
+    def largest_step(self, x: wp.array, direction: wp.array) -> float:
+        """Share in [0, 1] of `direction` that x can go without passing through anything."""
+        return min((term.largest_step(x, direction) for term in self.terms), default=1.0)
+
+    def reachable(self, x: wp.array, target: wp.array) -> bool:
+        """Whether the straight way from x to `target` passes through nothing."""
+        self.combine(target, 1.0, x, -1.0, self._difference)
+        return self.largest_step(x, self._difference) >= 1.0
+
+    def elastic_energy(self, x: wp.array) -> float:
         """Energy stored in the elements at x, J."""
-        self._over_elements(
-            fem.element_energy,
-            [self.elements, self.x, self._cauchy_green, 0.0],
-            [self._terms],
-        )
-        return float(self._terms.numpy()[: self.element_count].sum())
+        inputs = [self.elements, x, self._cauchy_green, 0.0]
+        self.over_elements(elements.element_energy, inputs, [self._energies])
+        return float(self._energies.numpy()[: self.element_count].sum())
 
-    def contact_energy(self) -> float:
-        """Energy stored in the ground penalty and friction springs at x, J."""
-        self._over_vertices(
-            fem.contact_energy, [self.vertices, self.ground, self.x, self.anchor], [self._terms]
-        )
-        return float(self._terms.numpy()[: self.vertex_count].sum())
-
-    def smallest_volume_ratio(self) -> float:
+    def smallest_volume_ratio(self, x: wp.array) -> float:
         """min over elements of det F at x."""
-        self._over_elements(fem.element_volume_ratio, [self.elements, self.x], [self._terms])
-        return float(self._terms.numpy()[: self.element_count].min())
+        self.over_elements(elements.element_volume_ratio, [self.elements, x], [self._energies])
+        return float(self._energies.numpy()[: self.element_count].min())
 
     def _total(self, terms: wp.array) -> float:
         launch_chunked(
@@ -246,71 +233,11 @@ class IncrementalPotential:
         )
         return float(self._sums.numpy().sum())
 
-    def _over_vertices(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+    def over_vertices(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
         launch_chunked(kernel, self.vertex_count, inputs, outputs, device=self.device, minimum=4096)
 
-    def _over_elements(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+    def over_elements(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
         launch_chunked(kernel, self.element_count, inputs, outputs, device=self.device, minimum=256)
-
-
-class _RestShapes(NamedTuple):
-    inverse: np.ndarray
-    volume: np.ndarray
-    mu: np.ndarray
-    lam: np.ndarray
-    mass: np.ndarray
-    mass_damping: np.ndarray
-
-
-def _rest_shapes(model: Model) -> _RestShapes:
-    corners = model.vertices.astype(np.float64)[model.tets]
-    shape = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    full_volume = np.linalg.det(shape) / 6.0
-    bad = np.flatnonzero(~(full_volume > 0.0))
-    if len(bad):
-        raise SolverError(
-            f"element {bad[0]} has volume {full_volume[bad[0]]:.3g} m^3 at rest ({len(bad)} such elements); "
-            "every tet must have positive volume: repair or re-tetrahedralize the mesh"
-        )
-    volume = full_volume * model.fill
-    young, poisson = model.young.astype(np.float64), model.poisson.astype(np.float64)
-    mu = young / (2.0 * (1.0 + poisson))
-    lam = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
-
-    share = np.repeat(model.density.astype(np.float64) * volume / 4.0, 4)
-    ids, count = model.tets.reshape(-1), len(model.vertices)
-    mass = np.bincount(ids, weights=share, minlength=count)
-    damped = np.bincount(ids, weights=share * np.repeat(model.rayleigh_mass, 4), minlength=count)
-    mass_damping = np.divide(damped, mass, out=np.zeros(count), where=mass > 0.0)
-    return _RestShapes(np.linalg.inv(shape), volume, mu, lam, mass, mass_damping)
-
-
-def _contact_scales(model: Model, rest: _RestShapes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ground stiffness N/m, friction spring stiffness N/m and ramp depth m of each vertex.
-
-    The ground stiffness follows the vertex's own elastic stiffness (so that a stiff body indents the ground
-    no more than itself) and its body's weight (so that a soft one does not sink).
-    """
-    first = -rest.inverse.sum(axis=1, keepdims=True)
-    gradients = np.concatenate([first, rest.inverse], axis=1)
-    modulus = rest.volume * (rest.lam + 2.0 * rest.mu)
-    per_corner = modulus[:, None] * np.einsum("eai,eai->ea", gradients, gradients)
-    count = len(model.vertices)
-    elastic = np.bincount(model.tets.reshape(-1), weights=per_corner.reshape(-1), minlength=count)
-
-    stiffness = CONTACT_PER_ELASTIC * elastic
-    ramp = np.zeros(count)
-    ranges = [body.vertex_range for body in model.bodies] or [(0, count)]
-    for begin, end in ranges:
-        size = float(np.linalg.norm(np.ptp(model.vertices[begin:end].astype(np.float64), axis=0)))
-        weight = STANDARD_GRAVITY * float(rest.mass[begin:end].sum())
-        stiffness[begin:end] += weight / (CONTACT_SAG * size)
-        ramp[begin:end] = CONTACT_RAMP * size
-    return model.fem.contact_stiffness * stiffness, STICK_PER_ELASTIC * elastic, ramp
-
-
-def _reals(values: np.ndarray, device: str) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, dtype=np.float64), dtype=wp.float64, device=device)
 
 
 __all__ = ["IncrementalPotential", "StepMeasures"]

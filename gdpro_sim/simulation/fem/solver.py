@@ -1,17 +1,23 @@
-"""Implicit finite elements: backward Euler by projected Newton on the incremental potential."""
+"""Finite elements in time: implicit steps by projected Newton on the potential, or explicit ones."""
 
 from __future__ import annotations
 
 import logging
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import warp as wp
 
 from gdpro_sim.errors import SolverError
+from gdpro_sim.kernels import fem
+from gdpro_sim.simulation.fem.ground import GroundContact
+from gdpro_sim.simulation.fem.integrators import ImplicitStep, State
 from gdpro_sim.simulation.fem.potential import IncrementalPotential
+from gdpro_sim.simulation.fem.rest import rest_shapes
 from gdpro_sim.simulation.fem.rigid_modes import RigidModes
+from gdpro_sim.simulation.fem.term import Step, Term
 from gdpro_sim.simulation.model import Diagnostics, Model
 
 logger = logging.getLogger(__name__)
@@ -27,6 +33,18 @@ MAX_SPLITS = 4
 
 NEGLIGIBLE = 0.01
 """A residual that inertia alone would undo within this share of the tolerance counts as solved."""
+
+RELAXATIONS = 60
+"""Pseudo-steps of a quasi-static step before it counts as not converged."""
+
+SLOWING = 4.0
+"""Each pseudo-step of a quasi-static step is this much longer than the one before."""
+
+EXPLICIT_SAFETY = 0.9
+"""Explicit steps are this share of the longest stable one, 2 / (largest frequency)."""
+
+MAX_EXPLICIT = 100_000
+"""Explicit substeps per step past which the solver refuses."""
 
 
 @dataclass
@@ -50,22 +68,36 @@ class _Outcome:
 class SolverFEM:
     """Linear-tet FEM for a compiled `Model`; implements `gdpro_sim.simulation.model.Solver`.
 
-    Stable neo-Hookean elasticity, lumped mass, Rayleigh damping, pinned vertices, and a ground with lagged
-    Coulomb friction. Positions and all solver arithmetic are float64. On the CPU results are the same bytes
-    for any number of threads.
+    Elements with lumped mass and Rayleigh damping, fixed vertices, and terms: the ground with lagged Coulomb
+    friction. Positions and all solver arithmetic are float64. On the CPU results are the same bytes for any
+    number of threads.
 
     Raises SolverError when an element has no volume at rest.
     """
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        self._potential = IncrementalPotential(model)
+        rest = rest_shapes(model)
+        self.terms: tuple[Term, ...] = () if model.ground is None else (GroundContact(model, rest),)
+        self._potential = IncrementalPotential(model, rest, self.terms)
         self._rigid = RigidModes(model.tets, self._potential.mass, self._potential.fixed)
         self._rest = model.vertices.astype(np.float64)
+        self._gravity = wp.vec3d(*model.gravity)
+        frequency = math.hypot(rest.frequency, *(term.frequency for term in self.terms))
+        self._explicit_dt = 2.0 * EXPLICIT_SAFETY / max(frequency, 1e-30)
         count = len(model.vertices)
-        self._saved = [
-            wp.zeros(count, dtype=kind, device=model.device) for kind in (wp.vec3d, wp.vec3d, wp.vec2d)
-        ]
+        self._state = State(count, model.device)
+        self._coasting, self._resting, self._held = (
+            wp.zeros(count, dtype=wp.vec3d, device=model.device) for _ in range(3)
+        )
+        self._changing = self._state.arrays()
+        for k, term in enumerate(self.terms):
+            self._changing.update({f"terms.{k}.{name}": array for name, array in term.state().items()})
+        self._saved = {name: wp.clone(array) for name, array in self._changing.items()}
+        self._initial = {name: array.numpy().copy() for name, array in self._changing.items()}
+        velocities = model.velocities.astype(np.float64)
+        velocities[self._potential.fixed] = 0.0
+        self._initial |= {"positions": self._rest, "velocities": velocities}
         self._time = 0.0
         self._counters = _Counters()
         self.reset()
@@ -78,45 +110,41 @@ class SolverFEM:
     @property
     def positions(self) -> np.ndarray:
         """[P, 3] float64 m, a copy."""
-        return self._potential.x.numpy().copy()
+        return self._state.x.numpy().copy()
 
     @property
     def velocities(self) -> np.ndarray:
         """[P, 3] float64 m/s, a copy."""
-        return self._potential.v.numpy().copy()
+        return self._state.v.numpy().copy()
 
     def reset(self) -> None:
         """Back to the model's initial state."""
-        velocities = self.model.velocities.astype(np.float64)
-        velocities[self._potential.fixed] = 0.0
-        self._set_state(self._rest, velocities, self._rest[:, :2])
+        self._assign(self._initial)
         self._time = 0.0
         self._counters = _Counters()
 
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds in `FemSettings.substeps` implicit steps, halving those that fail.
 
-        Raises SolverError, leaving the state as it was, if a substep has no finite solution. A substep that
-        stays unconverged at its shortest is accepted (it never raises the energy) and reported by
-        `diagnostics().converged`.
+        A quasi-static step goes to where forces balance at its end; an explicit one takes as many substeps
+        as are stable. Raises SolverError, leaving the state as it was, if a substep has no finite solution.
+        A substep that stays unconverged at its shortest is accepted (it never raises the energy) and
+        reported by `diagnostics().converged`.
         """
         if not (math.isfinite(dt) and dt > 0.0):
             raise SolverError(f"step length must be a finite number > 0 s, got {dt}")
-        state = self._state_arrays()
-        for saved, array in zip(self._saved, state, strict=True):
-            wp.copy(saved, array)
-        before = self._counters
+        for name, array in self._changing.items():
+            wp.copy(self._saved[name], array)
+        before, time = self._counters, self._time
         self._counters = _Counters()
-        count = self.model.fem.substeps
         try:
-            for _ in range(count):
-                self._advance(dt / count, 0)
+            self._advance_all(dt)
         except BaseException:  # Ctrl-C too: half a step is no state to continue from
-            for saved, array in zip(self._saved, state, strict=True):
-                wp.copy(array, saved)
-            self._counters = before
+            for name, array in self._changing.items():
+                wp.copy(array, self._saved[name])
+            self._counters, self._time = before, time
             raise
-        self._time += dt
+        self._time = time + dt
         if not self._counters.converged:
             logger.warning(
                 "FEM step to t = %.6g s did not converge: Newton still moves %.3g m/s (tolerance %.3g)",
@@ -125,53 +153,150 @@ class SolverFEM:
                 self.model.fem.newton_tolerance,
             )
 
-    def _advance(self, dt: float, splits: int) -> None:
-        outcome = self._minimise(dt)
+    def _advance_all(self, dt: float) -> None:
+        settings = self.model.fem
+        if settings.integrator == "explicit":
+            self._explicit(dt)
+        elif settings.integrator == "quasi-static":
+            self._relax(dt)
+        else:
+            for _ in range(settings.substeps):
+                self._advance(dt / settings.substeps, settings.integrator, 0)
+
+    def _advance(self, dt: float, rule: Literal["backward-euler", "bdf2", "midpoint"], splits: int) -> None:
+        if rule == "midpoint" and self._touching(self._state.x):
+            rule = "backward-euler"
+        step, outcome = self._minimise(dt, rule)
         if not outcome.converged and splits < MAX_SPLITS:
             logger.debug("substep of %.3g s failed (%s): halved", dt, outcome)
-            self._advance(dt / 2.0, splits + 1)
-            self._advance(dt / 2.0, splits + 1)
+            self._advance(dt / 2.0, rule, splits + 1)
+            self._advance(dt / 2.0, rule, splits + 1)
             return
         if not outcome.finite:
             raise SolverError(
                 f"no finite solution for a substep of {dt:.3g} s at t = {self._time:.6g} s: raise the "
                 "substeps, or check velocities and material constants"
             )
-        self._potential.accept()
+        if (rule == "midpoint" and self._touching(self._potential.trial)) or not step.finish():
+            logger.debug("midpoint step of %.3g s meets something: backward Euler instead", dt)
+            self._advance(dt, "backward-euler", splits)
+            return
+        self._time += dt
         counters = self._counters
         counters.substeps += 1
         counters.converged &= outcome.converged
         counters.residual = max(counters.residual, outcome.residual)
 
-    def _minimise(self, dt: float) -> _Outcome:
+    def _touching(self, x: wp.array) -> bool:
+        return any(term.report(x).get("contacts", 0.0) > 0.0 for term in self.terms)
+
+    def _relax(self, dt: float) -> None:
+        """Where forces balance at the end of the step: backward Euler from rest, in ever longer steps.
+
+        Converged once a pseudo-step a thousand times dt long moves nothing by newton_tolerance * dt.
+        """
+        state, counters, settings = self._state, self._counters, self.model.fem
+        self._time += dt
+        pseudo, longest = dt, 1e3 * dt
+        for _ in range(RELAXATIONS):
+            state.v.zero_()
+            state.dt_before.zero_()
+            before = state.x.numpy().copy()
+            step, outcome = self._minimise(pseudo, "backward-euler", time=self._time - pseudo)
+            counters.substeps += 1
+            if outcome.finite and outcome.converged:
+                step.finish()
+                moved = float(np.linalg.norm(state.x.numpy() - before, axis=1).max(initial=0.0))
+                counters.residual = moved / dt
+                if pseudo >= longest and moved <= settings.newton_tolerance * dt:
+                    state.v.zero_()
+                    return
+                pseudo = min(SLOWING * pseudo, longest)
+            else:
+                pseudo *= 0.25
+        state.v.zero_()
+        counters.converged = False
+
+    def _explicit(self, dt: float) -> None:
+        """Symplectic Euler, v then x, in substeps short enough for the stiffest element."""
+        p, state = self._potential, self._state
+        count = max(self.model.fem.substeps, math.ceil(dt / self._explicit_dt))
+        if count > MAX_EXPLICIT:
+            raise SolverError(
+                f"explicit steps of {self._explicit_dt:.3g} s would be needed {count:,} times in a step of "
+                f"{dt:.3g} s (at most {MAX_EXPLICIT:,}); use an implicit integrator"
+            )
+        h = dt / count
+        for _ in range(count):
+            step = Step(self._time + h, h, state.x, state.v, p.base, self._held)
+            wp.copy(self._held, state.x)
+            p.begin(step)
+            # Strain rates over the step before: C now less C then, over its length.
+            known = float(state.dt_before.numpy()[0]) > 0.0
+            p.strain_base(state.x_before if known else state.x, 1.0, state.x, 0.0)
+            p.lag(state.x)
+            p.forces(state.x)
+            wp.copy(state.x_before, state.x)
+            p.over_vertices(
+                fem.kick, [p.vertices, p.element_gradient, p.gradient, self._gravity, h], [state.v]
+            )
+            p.combine(state.x, 1.0, state.v, h, p.trial)
+            p.hold(self._held, p.trial)
+            if p.terms and not p.reachable(state.x, p.trial):
+                raise SolverError(
+                    f"an explicit step of {h:.3g} s at t = {self._time:.6g} s would pass through something; "
+                    "use an implicit integrator, or raise the substeps"
+                )
+            wp.copy(state.x, p.trial)
+            state.dt_before.fill_(h)
+            for term in p.terms:
+                term.finish(state.x)
+            self._time += h
+        if not math.isfinite(p.elastic_energy(state.x)):
+            raise SolverError(
+                f"an element turned inside out in explicit steps of {h:.3g} s to t = {self._time:.6g} s; use "
+                "an implicit integrator, or raise the substeps"
+            )
+        self._counters.substeps += count
+
+    def _minimise(
+        self, dt: float, rule: Literal["backward-euler", "bdf2", "midpoint"], *, time: float | None = None
+    ) -> tuple[ImplicitStep, _Outcome]:
         """Projected Newton on the incremental potential; leaves the result in the potential's trial."""
+        when = self._time if time is None else time
+        step = ImplicitStep(rule, self._potential, self._state, self._held, when, dt, self._gravity)
+        step.begin(self._coasting, self._resting)
+        return step, self._newton(step.step.h)
+
+    def _newton(self, h: float) -> _Outcome:
         potential, settings = self._potential, self.model.fem
-        tolerance = settings.newton_tolerance * dt
-        potential.begin(dt)
+        tolerance = settings.newton_tolerance * h
         energy = self._choose_start()
+        if not math.isfinite(energy):
+            return _Outcome(converged=False, finite=False, residual=math.inf)
         residual = math.inf
         for iteration in range(settings.newton_iterations):
-            wp.copy(potential.base, potential.trial)
-            # Lagged friction: limits follow the iterate, then stay, so that the late iterations descend on
-            # one fixed energy.
+            wp.copy(potential.start, potential.trial)
+            # Lagged values follow the iterate, then stay, so that the late iterations descend on one fixed
+            # energy.
             if iteration <= settings.newton_iterations // 2:
-                potential.update_friction(potential.base)
-                energy = potential.energy(potential.base, elements_unchanged=True)
-            potential.linearise(potential.base)
+                potential.lag(potential.start)
+                energy = potential.energy(potential.start, elements_unchanged=True)
+            potential.linearise(potential.start)
             acceleration = potential.largest_acceleration()
             if not (math.isfinite(energy) and math.isfinite(acceleration)):
                 return _Outcome(converged=False, finite=False, residual=residual)
-            if acceleration * dt * dt <= NEGLIGIBLE * tolerance:
-                return _Outcome(converged=True, finite=True, residual=acceleration * dt)
+            if acceleration * h * h <= NEGLIGIBLE * tolerance:
+                return _Outcome(converged=True, finite=True, residual=acceleration * h)
 
             report = potential.system.solve(settings.cg_tolerance, settings.cg_iterations)
             slope, largest_move = potential.step_measures()
-            negligible = NEGLIGIBLE * max(tolerance, 0.1 * largest_move) / (dt * dt)
-            if self._rigid.correct(potential.system, potential.base.numpy(), negligible):
+            negligible = NEGLIGIBLE * max(tolerance, 0.1 * largest_move) / (h * h)
+            if self._rigid.correct(potential.system, potential.start.numpy(), negligible):
                 slope, largest_move = potential.step_measures()
             self._counters.newton_iterations += 1
             self._counters.cg_iterations += report.iterations
-            residual = largest_move / dt
+            residual = largest_move / h
             if not (math.isfinite(slope) and math.isfinite(largest_move)):
                 return _Outcome(converged=False, finite=False, residual=residual)
 
@@ -183,32 +308,42 @@ class SolverFEM:
         return _Outcome(converged=False, finite=True, residual=residual)
 
     def _choose_start(self) -> float:
-        """Put the lowest of three guesses into the trial: resting, coasting, falling. Returns its energy."""
-        potential = self._potential
-        potential.update_friction(potential.x)
-        guesses = (potential.x, potential.coasting, potential.inertia)
-        energies = [potential.energy(guess) for guess in guesses]
-        best = min(range(len(guesses)), key=energies.__getitem__)
-        wp.copy(potential.trial, guesses[best])
-        if best == len(guesses) - 1:
-            return energies[best]
-        return potential.energy(potential.trial)
+        """Put the lowest guess that can be reached into the trial: resting, coasting, falling.
+
+        Returns its energy; infinity where none can be reached or has a finite one.
+        """
+        potential, x = self._potential, self._state.x
+        potential.lag(x)
+        best, lowest = None, math.inf
+        guesses = (self._resting, self._coasting, potential.inertia)
+        last = None
+        for guess in guesses:
+            if potential.reachable(x, guess):
+                energy = potential.energy(guess)
+                last = guess
+                if energy < lowest:
+                    best, lowest = guess, energy
+        if best is None:
+            return math.inf
+        wp.copy(potential.trial, best)
+        return lowest if best is last else potential.energy(potential.trial)
 
     def _line_search(self, energy: float, slope: float) -> tuple[float, float]:
         """Halve the step until the energy falls enough: (length, energy there); (0, energy) if it never does.
 
-        An inverted element has infinite energy, so no accepted step inverts one.
+        It starts no longer than the way is free. An inverted element has infinite energy, so no accepted step
+        inverts one.
         """
         potential = self._potential
         noise = potential.energy_noise + 1e-14 * abs(energy)
-        length = 1.0
+        length = potential.largest_step(potential.start, potential.system.solution)
         for _ in range(MAX_HALVINGS):
             potential.move_trial(length)
             trial = potential.energy(potential.trial)
             if trial <= energy + ARMIJO * length * slope + noise:
                 return length, trial
             length *= 0.5
-        wp.copy(potential.trial, potential.base)
+        wp.copy(potential.trial, potential.start)
         return 0.0, energy
 
     def surface_positions(self, body: int) -> np.ndarray:
@@ -219,42 +354,33 @@ class SolverFEM:
         item = self.model.bodies[body]
         begin, end = item.tet_range
         ids = self.model.tets[begin:end][item.embedding.tet_ids]
-        displacement = self._potential.x.numpy() - self._rest
+        displacement = self._state.x.numpy() - self._rest
         moved = np.einsum("va,vai->vi", item.embedding.weights.astype(np.float64), displacement[ids])
         return (item.surface + moved).astype(np.float32)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Everything needed to continue to the same bytes: float64 arrays, safe for `np.savez`."""
         c = self._counters
-        positions, velocities, anchors = (array.numpy().copy() for array in self._state_arrays())
         counters = [c.substeps, c.newton_iterations, c.cg_iterations, c.converged, c.residual]
         return {
             "time": np.array(self._time, dtype=np.float64),
-            "positions": positions,
-            "velocities": velocities,
-            "anchors": anchors,
             "counters": np.array(counters, dtype=np.float64),
+            **{name: array.numpy().copy() for name, array in self._changing.items()},
         }
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
         """Continue from a `state_dict` of the same model. Raises SolverError where it does not fit."""
-        count = len(self._rest)
-        shapes: dict[str, tuple[int, ...]] = {
-            "time": (),
-            "positions": (count, 3),
-            "velocities": (count, 3),
-            "anchors": (count, 2),
-            "counters": (5,),
-        }
-        for name, shape in shapes.items():
+        shapes = {name: array.shape for name, array in self._initial.items()}
+        for name, shape in {"time": (), "counters": (5,), **shapes}.items():
             if name not in state:
-                raise SolverError(f"the saved FEM state has no {name!r}; it must hold {', '.join(shapes)}")
+                needed = ", ".join(["time", "counters", *shapes])
+                raise SolverError(f"the saved FEM state has no {name!r}; it must hold {needed}")
             if state[name].shape != shape:
                 raise SolverError(
                     f"the saved FEM state's {name!r} has shape {state[name].shape}, this model "
                     f"needs {shape}: it was saved from another scene"
                 )
-        self._set_state(state["positions"], state["velocities"], state["anchors"])
+        self._assign({name: state[name] for name in shapes})
         self._time = float(state["time"])
         substeps, newton, cg, converged, residual = state["counters"].tolist()
         self._counters = _Counters(int(substeps), int(newton), int(cg), bool(converged), residual)
@@ -266,21 +392,19 @@ class SolverFEM:
         mass = potential.mass[:, None]
         momentum = (mass * v).sum(axis=0)
         angular = (mass * np.cross(x, v)).sum(axis=0)
-        ground = self.model.ground
-        offset = self.model.contact_offset
-        depth = ground.height - offset - x[:, 2] if ground is not None else np.zeros(len(x))
+        reports = [term.report(self._state.x) for term in self.terms]
         c = self._counters
         return Diagnostics(
             time=self._time,
             kinetic_energy=float(0.5 * (mass * v * v).sum()),
-            elastic_energy=potential.elastic_energy(),
+            elastic_energy=potential.elastic_energy(self._state.x),
             gravity_energy=float(-(mass * x).sum(axis=0) @ np.asarray(self.model.gravity, dtype=np.float64)),
-            contact_energy=potential.contact_energy(),
+            contact_energy=sum(term.stored(self._state.x) for term in self.terms),
             momentum=(float(momentum[0]), float(momentum[1]), float(momentum[2])),
             angular_momentum=(float(angular[0]), float(angular[1]), float(angular[2])),
-            contacts=int(np.count_nonzero(depth > 0.0)),
-            max_penetration=float(max(0.0, depth.max(initial=0.0))),
-            min_volume_ratio=potential.smallest_volume_ratio(),
+            contacts=int(sum(report.get("contacts", 0.0) for report in reports)),
+            max_penetration=max((report.get("penetration", 0.0) for report in reports), default=0.0),
+            min_volume_ratio=potential.smallest_volume_ratio(self._state.x),
             substeps=c.substeps,
             newton_iterations=c.newton_iterations,
             cg_iterations=c.cg_iterations,
@@ -288,12 +412,9 @@ class SolverFEM:
             residual=c.residual,
         )
 
-    def _state_arrays(self) -> tuple[wp.array, wp.array, wp.array]:
-        return self._potential.x, self._potential.v, self._potential.anchor
-
-    def _set_state(self, positions: np.ndarray, velocities: np.ndarray, anchors: np.ndarray) -> None:
-        for array, values in zip(self._state_arrays(), (positions, velocities, anchors), strict=True):
-            array.assign(np.ascontiguousarray(values, dtype=np.float64))
+    def _assign(self, values: dict[str, np.ndarray]) -> None:
+        for name, array in self._changing.items():
+            array.assign(np.ascontiguousarray(values[name], dtype=np.float64))
 
 
 __all__ = ["SolverFEM"]

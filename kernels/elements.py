@@ -1,0 +1,211 @@
+"""Linear tetrahedra: energies, forces and projected Hessian blocks, each element on its own.
+
+F = sum_a x_a (x) grad N_a with constant gradients, the rows of the inverse rest shape matrix. Vertices and
+matrix entries gather what elements wrote, in a fixed order (`gdpro_sim.kernels.fem`).
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from gdpro_sim.kernels.decomposition import singular_value_decomposition
+from gdpro_sim.kernels.elasticity import (
+    energy_density,
+    green_strain_increment,
+    piola_stress,
+    principal_block,
+    principal_hessian,
+    viscous_block,
+    viscous_energy,
+    viscous_stress,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Elements:
+    """Constant element data."""
+
+    tets: wp.array[wp.vec4i]
+    inverse_rest: wp.array[wp.mat33d]  # rows are grad N_1..N_3, 1/m
+    volume: wp.array[wp.float64]  # m^3, weighted by fill
+    mu: wp.array[wp.float64]  # Pa
+    lam: wp.array[wp.float64]  # Pa
+    damping: wp.array[wp.float64]  # Rayleigh stiffness damping, s
+
+
+@wp.func
+def deformation_gradient(tet: wp.vec4i, inverse_rest: wp.mat33d, x: wp.array[wp.vec3d]) -> wp.mat33d:
+    x0 = x[tet[0]]
+    edges = wp.matrix_from_cols(x[tet[1]] - x0, x[tet[2]] - x0, x[tet[3]] - x0)
+    return edges * inverse_rest
+
+
+@wp.kernel
+def element_cauchy_green(
+    start: int,
+    # In:
+    elements: Elements,
+    a: wp.array[wp.vec3d],
+    weight_a: wp.float64,
+    b: wp.array[wp.vec3d],
+    weight_b: wp.float64,
+    # Out:
+    cauchy_green_out: wp.array[wp.mat33d],
+):
+    """weight_a C(a) + weight_b C(b) with C = F^T F: what the damping measures its strain increment from."""
+    e = start + wp.tid()
+    F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], a)
+    total = weight_a * (wp.transpose(F) * F)
+    if weight_b != wp.float64(0.0):
+        G = deformation_gradient(elements.tets[e], elements.inverse_rest[e], b)
+        total += weight_b * (wp.transpose(G) * G)
+    cauchy_green_out[e] = total
+
+
+@wp.kernel
+def element_volume_ratio(
+    start: int,
+    # In:
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    # Out:
+    ratio_out: wp.array[wp.float64],
+):
+    e = start + wp.tid()
+    ratio_out[e] = wp.determinant(deformation_gradient(elements.tets[e], elements.inverse_rest[e], x))
+
+
+@wp.kernel
+def element_energy(
+    start: int,
+    # In:
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    cauchy_green: wp.array[wp.mat33d],
+    inverse_dt: wp.float64,
+    # Out:
+    energy_out: wp.array[wp.float64],
+):
+    """Elastic energy plus damping potential of each element, J. inverse_dt = 0 leaves the damping out."""
+    e = start + wp.tid()
+    F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
+    mu = elements.mu[e]
+    lam = elements.lam[e]
+    density = energy_density(F, mu, lam)
+    rate = elements.damping[e] * inverse_dt
+    if rate > wp.float64(0.0):
+        strain = green_strain_increment(F, cauchy_green[e])
+        density += viscous_energy(strain, rate * mu, rate * lam)
+    energy_out[e] = elements.volume[e] * density
+
+
+@wp.func
+def write_forces(
+    e: int,
+    elements: Elements,
+    F: wp.mat33d,
+    cauchy_green: wp.array[wp.mat33d],
+    rate: wp.float64,
+    gradient_out: wp.array[wp.vec3d],
+):
+    """The four vectors of an element's gradient; `rate` is its damping over the step, 0 for none."""
+    mu = elements.mu[e]
+    lam = elements.lam[e]
+    P = piola_stress(F, mu, lam)
+    if rate > wp.float64(0.0):
+        P += viscous_stress(F, green_strain_increment(F, cauchy_green[e]), rate * mu, rate * lam)
+    forces = (elements.volume[e] * P) * wp.transpose(elements.inverse_rest[e])
+    f1 = wp.vec3d(forces[0, 0], forces[1, 0], forces[2, 0])
+    f2 = wp.vec3d(forces[0, 1], forces[1, 1], forces[2, 1])
+    f3 = wp.vec3d(forces[0, 2], forces[1, 2], forces[2, 2])
+    gradient_out[4 * e] = -(f1 + f2 + f3)
+    gradient_out[4 * e + 1] = f1
+    gradient_out[4 * e + 2] = f2
+    gradient_out[4 * e + 3] = f3
+
+
+@wp.kernel
+def element_gradient(
+    start: int,
+    # In:
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    cauchy_green: wp.array[wp.mat33d],
+    inverse_dt: wp.float64,
+    # Out:
+    gradient_out: wp.array[wp.vec3d],
+):
+    """Gradient (4 vectors) of each element."""
+    e = start + wp.tid()
+    F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
+    write_forces(e, elements, F, cauchy_green, elements.damping[e] * inverse_dt, gradient_out)
+
+
+@wp.kernel
+def element_derivatives(
+    start: int,
+    # In:
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    cauchy_green: wp.array[wp.mat33d],
+    inverse_dt: wp.float64,
+    # Out:
+    gradient_out: wp.array[wp.vec3d],
+    blocks_out: wp.array[wp.mat33d],
+):
+    """Gradient (4 vectors) and projected Hessian (10 blocks, a <= b, row by row) of each element.
+
+    Shape gradients sum to zero, so the blocks of corner 0 follow from the six of corners 1 to 3.
+    """
+    e = start + wp.tid()
+    inverse_rest = elements.inverse_rest[e]
+    F = deformation_gradient(elements.tets[e], inverse_rest, x)
+    volume = elements.volume[e]
+    mu = elements.mu[e]
+    lam = elements.lam[e]
+    rate = elements.damping[e] * inverse_dt
+
+    write_forces(e, elements, F, cauchy_green, rate, gradient_out)
+    U, s, V = singular_value_decomposition(F)
+    A, pairs = principal_hessian(s, mu, lam)
+    rotated = inverse_rest * V
+    g1 = wp.vec3d(rotated[0, 0], rotated[0, 1], rotated[0, 2])
+    g2 = wp.vec3d(rotated[1, 0], rotated[1, 1], rotated[1, 2])
+    g3 = wp.vec3d(rotated[2, 0], rotated[2, 1], rotated[2, 2])
+    k11 = principal_block(A, pairs, g1, g1)
+    k12 = principal_block(A, pairs, g1, g2)
+    k13 = principal_block(A, pairs, g1, g3)
+    k22 = principal_block(A, pairs, g2, g2)
+    k23 = principal_block(A, pairs, g2, g3)
+    k33 = principal_block(A, pairs, g3, g3)
+    if rate > wp.float64(0.0):
+        k11 += viscous_block(s, g1, g1, rate * mu, rate * lam)
+        k12 += viscous_block(s, g1, g2, rate * mu, rate * lam)
+        k13 += viscous_block(s, g1, g3, rate * mu, rate * lam)
+        k22 += viscous_block(s, g2, g2, rate * mu, rate * lam)
+        k23 += viscous_block(s, g2, g3, rate * mu, rate * lam)
+        k33 += viscous_block(s, g3, g3, rate * mu, rate * lam)
+    W = volume * U
+    Ut = wp.transpose(U)
+    k11 = W * k11 * Ut
+    k12 = W * k12 * Ut
+    k13 = W * k13 * Ut
+    k22 = W * k22 * Ut
+    k23 = W * k23 * Ut
+    k33 = W * k33 * Ut
+    k01 = -(k11 + wp.transpose(k12) + wp.transpose(k13))
+    k02 = -(k12 + k22 + wp.transpose(k23))
+    k03 = -(k13 + k23 + k33)
+    b = 10 * e
+    blocks_out[b] = -(k01 + k02 + k03)
+    blocks_out[b + 1] = k01
+    blocks_out[b + 2] = k02
+    blocks_out[b + 3] = k03
+    blocks_out[b + 4] = k11
+    blocks_out[b + 5] = k12
+    blocks_out[b + 6] = k13
+    blocks_out[b + 7] = k22
+    blocks_out[b + 8] = k23
+    blocks_out[b + 9] = k33
