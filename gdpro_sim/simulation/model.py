@@ -46,7 +46,8 @@ class FemSettings:
     """How the FEM solver steps.
 
     integrator:        "backward-euler" damps motion a little and is never unstable; "bdf2" and "midpoint"
-                       damp far less (midpoint where nothing touches; else it is backward Euler); "quasi-static" goes to where forces balance, without inertia;
+                       damp far less (midpoint where nothing touches, else it is backward Euler);
+                       "quasi-static" goes to where forces balance, without inertia;
                        "explicit" is symplectic Euler in as many substeps as stability needs
     substeps:          implicit steps per `step(dt)`; a substep that fails is halved by the solver
     newton_iterations: most projected-Newton iterations in one substep before it counts as failed
