@@ -8,9 +8,15 @@ from __future__ import annotations
 
 import difflib
 import math
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+Law = Literal["stable_neo_hookean", "neo_hookean", "corotated", "stvk_hencky", "linear"]
+"""Constitutive laws; `gdpro_sim.kernels.elasticity` gives their energies."""
+
+LAWS: tuple[str, ...] = get_args(Law)
+"""In the order of the numbers that the kernels know them by."""
 
 PRESETS: dict[str, dict[str, float]] = {
     # Gelatin dessert: E 1-30 kPa over concentration (Markidou et al. 2005, Med. Eng. Phys. 27).
@@ -182,18 +188,30 @@ PRESETS: dict[str, dict[str, float]] = {
 
 
 class Material(BaseModel):
-    """An isotropic hyperelastic material, stable neo-Hookean (Smith, de Goes & Kim 2018)."""
+    """An isotropic hyperelastic material, stable neo-Hookean (Smith, de Goes & Kim 2018) unless it says else.
+
+    With a yield stress it is elastic-plastic: von Mises with linear isotropic hardening, in logarithmic
+    strain, which takes the law "stvk_hencky".
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: str | None = Field(default=None, description="name of the preset the values started from")
-    model: Literal["stable_neo_hookean"] = "stable_neo_hookean"
+    model: Law = Field(
+        default="stable_neo_hookean",
+        description='constitutive law; with a yield stress "stvk_hencky"; "linear" is for small strains and '
+        "rotations",
+    )
     young: float = Field(gt=0.0, description="Young's modulus, Pa")
     poisson: float = Field(ge=0.0, lt=0.5, description="Poisson's ratio")
     density: float = Field(gt=0.0, description="kg/m^3")
     friction: float = Field(default=0.5, ge=0.0, description="Coulomb coefficient against the ground")
     rayleigh_mass: float = Field(default=0.0, ge=0.0, description="Rayleigh damping on mass, 1/s")
     rayleigh_stiffness: float = Field(default=0.0, ge=0.0, description="Rayleigh damping on stiffness, s")
+    yield_stress: float | None = Field(
+        default=None, gt=0.0, description="von Mises stress at which it starts to flow, Pa; default: never"
+    )
+    hardening: float = Field(default=0.0, ge=0.0, description="yield stress gained per plastic strain, Pa")
 
     @model_validator(mode="before")
     @classmethod
@@ -207,14 +225,32 @@ class Material(BaseModel):
                 hint = f" (did you mean {near[0]!r}?)" if near else ""
                 raise ValueError(f"unknown material {name!r}{hint}; presets: {', '.join(PRESETS)}")
             value = {**PRESETS[name], **value}
+        if isinstance(value, dict) and value.get("yield_stress") is not None:
+            value = {"model": "stvk_hencky", **value}
         return value
 
-    @field_validator("young", "density", "friction", "rayleigh_mass", "rayleigh_stiffness")
+    @field_validator(
+        "young", "density", "friction", "rayleigh_mass", "rayleigh_stiffness", "yield_stress", "hardening"
+    )
     @classmethod
-    def _finite(cls, value: float) -> float:
-        if not math.isfinite(value):
+    def _finite(cls, value: float | None) -> float | None:
+        if value is not None and not math.isfinite(value):
             raise ValueError(f"must be finite, got {value}")
         return value
+
+    @model_validator(mode="after")
+    def _plastic_law(self) -> Material:
+        if self.yield_stress is not None and self.model != "stvk_hencky":
+            raise ValueError(
+                f'a material with a yield stress needs the law "stvk_hencky", got {self.model!r}; leave '
+                "model out, or set yield_stress to null"
+            )
+        return self
+
+    @property
+    def law(self) -> int:
+        """Number of the constitutive law in the kernels."""
+        return LAWS.index(self.model)
 
     @property
     def lame(self) -> tuple[float, float]:
@@ -223,4 +259,4 @@ class Material(BaseModel):
         return lam, self.young / (2.0 * (1.0 + self.poisson))
 
 
-__all__ = ["PRESETS", "Material"]
+__all__ = ["LAWS", "PRESETS", "Law", "Material"]

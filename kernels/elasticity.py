@@ -1,14 +1,27 @@
-"""Constitutive models: energy density, first Piola-Kirchhoff stress, and the projected Hessian.
+"""Constitutive laws: energy density, first Piola-Kirchhoff stress, and the projected Hessian.
 
-Stable neo-Hookean (Smith, de Goes & Kim 2018, "Stable Neo-Hookean Flesh Simulation", ACM TOG 37(2)), eq. 13
-without the logarithmic rest-stability term, as in Kim & Eberle, "Dynamic Deformables" (2020), ch. 6:
+With singular values s of F (U diag(s) V^T, rotations), J = det F and Lame parameters mu, lambda, J/m^3:
 
-    Psi(F) = mu/2 (F:F - 3) + U(det F),   U(J) = -mu (J - 1) + L/2 (J - 1)^2 + barrier(J)
+    STABLE_NEO_HOOKEAN  mu/2 (F:F - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2 + barrier(J)
+    NEO_HOOKEAN         mu/2 (F:F - 3) - mu log J + lambda/2 (log J)^2
+    COROTATED           mu sum_i (s_i - 1)^2 + lambda/2 (J - 1)^2 + barrier(J)
+    STVK_HENCKY         mu sum_i (log s_i)^2 + lambda/2 (sum_i log s_i)^2, limited by a yield stress
+    LINEAR              mu e:e + lambda/2 tr(e)^2,  e = (F + F^T)/2 - 1
 
-with L = lambda + mu so that small strains see the Lame parameters (lambda, mu). The barrier is zero for
-J >= 0.2 and grows without bound as J -> 0, so that a line search that rejects infinite energy keeps every
-element uninverted: barrier(J) = -k (J - J0)^2 ln(J / J0), the C2 clamped logarithm of Li et al. 2020,
-"Incremental Potential Contact", eq. 6, with the volume ratio in place of a distance.
+Sources, in this order: Smith, de Goes & Kim 2018, "Stable Neo-Hookean Flesh Simulation", ACM TOG 37(2),
+eq. 13 without the logarithmic rest-stability term, as in Kim & Eberle 2020, "Dynamic Deformables", ch. 6;
+Sifakis & Barbic 2012, "FEM simulation of 3D deformable solids", sec. 3.5; Stomakhin et al. 2012,
+"Energetically consistent invertible elasticity" (fixed corotated); Klar et al. 2016, "Drucker-Prager
+elastoplasticity for sand animation", and `gdpro_sim.kernels.plasticity`; Sifakis & Barbic 2012, sec. 3.2. All
+agree at small strains. The scaling, twist and flip modes of the Hessians: Smith, de Goes & Kim 2019,
+"Analytic eigensystems for isotropic distortion energies", ACM TOG 38(1).
+
+Inversion. The two laws with logarithms are infinite at J <= 0 by themselves. The barrier makes the stable
+neo-Hookean and the corotated law so: it is zero for J >= 0.2 and grows without bound as J -> 0,
+barrier(J) = -2 (lambda + mu) (J - 0.2)^2 log(J / 0.2), the C2 clamped logarithm of Li et al. 2020,
+"Incremental Potential Contact", eq. 6, with the volume ratio in place of a distance. A line search that
+rejects infinite energy then keeps every element uninverted. Linear elasticity is meant for small strains and
+rotations and knows no inversion: its energy is finite everywhere.
 
 All functions are float64: the incremental potential is compared between nearly equal states, and a stiff
 body's stress is a small difference of large numbers. Measured on the CPU, float64 costs about 10 % here.
@@ -18,12 +31,30 @@ from __future__ import annotations
 
 import warp as wp
 
-from gdpro_sim.kernels.decomposition import project_symmetric
+from gdpro_sim.kernels.decomposition import project_symmetric, singular_value_decomposition
+from gdpro_sim.kernels.plasticity import ROOT_SIX, deviator, equivalent_stress, excess_stress, log_stretches
 
 wp.set_module_options({"enable_backward": False})
 
+STABLE_NEO_HOOKEAN = wp.constant(0)
+NEO_HOOKEAN = wp.constant(1)
+COROTATED = wp.constant(2)
+STVK_HENCKY = wp.constant(3)
+LINEAR = wp.constant(4)
+
 BARRIER_J = wp.constant(wp.float64(0.2))
 """Volume ratio below which an element resists further compression without bound."""
+
+
+@wp.struct
+class Constants:
+    """What a law knows of one element or particle."""
+
+    law: int
+    mu: wp.float64  # Lame parameters, Pa
+    lam: wp.float64
+    limit: wp.float64  # present yield stress, Pa; inf: elastic. STVK_HENCKY alone yields
+    hardening: wp.float64  # growth of the yield stress with plastic strain, Pa
 
 
 @wp.func
@@ -35,69 +66,216 @@ def determinant_gradient(F: wp.mat33d) -> wp.mat33d:
     return wp.matrix_from_cols(wp.cross(f1, f2), wp.cross(f2, f0), wp.cross(f0, f1))
 
 
+# ---- laws of F:F or |F - R|^2 plus a function U of J: neo-Hookean, stable neo-Hookean, corotated ----
+
+
 @wp.func
-def volumetric_energy(J: wp.float64, mu: wp.float64, lam: wp.float64) -> wp.float64:
-    """U(J); infinite for J <= 0. `lam` is the Lame parameter lambda."""
-    if J <= wp.float64(0.0):
-        return wp.float64(wp.inf)
-    L = lam + mu
+def volumetric_energy(J: wp.float64, m: Constants) -> wp.float64:
+    """U(J) for J > 0, J/m^3."""
+    if m.law == NEO_HOOKEAN:
+        log = wp.log(J)
+        return wp.float64(0.5) * m.lam * log * log - m.mu * log
+    L = m.lam
+    slope = wp.float64(0.0)
+    if m.law == STABLE_NEO_HOOKEAN:
+        L += m.mu
+        slope = m.mu
     d = J - wp.float64(1.0)
-    energy = wp.float64(0.5) * L * d * d - mu * d
+    energy = wp.float64(0.5) * L * d * d - slope * d
     if J < BARRIER_J:
         c = J - BARRIER_J
-        energy -= wp.float64(2.0) * L * c * c * wp.log(J / BARRIER_J)
+        energy -= wp.float64(2.0) * (m.lam + m.mu) * c * c * wp.log(J / BARRIER_J)
     return energy
 
 
 @wp.func
-def volumetric_derivatives(J: wp.float64, mu: wp.float64, lam: wp.float64):
-    """(U'(J), U''(J)) for J > 0."""
-    L = lam + mu
-    first = L * (J - wp.float64(1.0)) - mu
+def volumetric_derivatives(J: wp.float64, m: Constants):
+    """(U'(J), U''(J)) for J > 0, Pa."""
+    if m.law == NEO_HOOKEAN:
+        slope = (m.lam * wp.log(J) - m.mu) / J
+        return slope, (m.lam / J - slope) / J
+    L = m.lam
+    first = wp.float64(0.0)
+    if m.law == STABLE_NEO_HOOKEAN:
+        L += m.mu
+        first = -m.mu
+    first += L * (J - wp.float64(1.0))
     second = L
     if J < BARRIER_J:
         c = J - BARRIER_J
         ratio = c / J
         log = wp.log(J / BARRIER_J)
-        k = wp.float64(2.0) * L
+        k = wp.float64(2.0) * (m.lam + m.mu)
         first -= k * (wp.float64(2.0) * c * log + c * ratio)
         second -= k * (wp.float64(2.0) * log + wp.float64(4.0) * ratio - ratio * ratio)
     return first, second
 
 
 @wp.func
-def energy_density(F: wp.mat33d, mu: wp.float64, lam: wp.float64) -> wp.float64:
-    """Psi(F), J/m^3; infinite where det F <= 0."""
-    shear = wp.float64(0.5) * mu * (wp.ddot(F, F) - wp.float64(3.0))
-    return shear + volumetric_energy(wp.determinant(F), mu, lam)
+def projected_pair(flip: wp.float64, twist: wp.float64) -> wp.vec2d:
+    """Projection of [[diagonal, off], [off, diagonal]] to positive semidefinite, as (diagonal, off).
+
+    Its eigenvalues are diagonal + off for the symmetric combination (flip) and diagonal - off for the
+    antisymmetric one (twist).
+    """
+    up = wp.max(flip, wp.float64(0.0))
+    down = wp.max(twist, wp.float64(0.0))
+    return wp.vec2d(wp.float64(0.5) * (up + down), wp.float64(0.5) * (up - down))
+
+
+# ---- Hencky's law, with the condensed potential W of `gdpro_sim.kernels.plasticity` ----
 
 
 @wp.func
-def piola_stress(F: wp.mat33d, mu: wp.float64, lam: wp.float64) -> wp.mat33d:
-    """First Piola-Kirchhoff stress P = mu F + U'(J) cof F, Pa."""
-    first, _second = volumetric_derivatives(wp.determinant(F), mu, lam)
-    return mu * F + first * determinant_gradient(F)
+def hencky_energy(s: wp.vec3d, m: Constants) -> wp.float64:
+    """W, J/m^3; infinite where the last singular value is not positive."""
+    if s[2] <= wp.float64(0.0):
+        return wp.float64(wp.inf)
+    e = log_stretches(s)
+    trace = e[0] + e[1] + e[2]
+    over = excess_stress(e, m.mu, m.limit)
+    elastic = m.mu * wp.dot(e, e) + wp.float64(0.5) * m.lam * trace * trace
+    return elastic - wp.float64(0.5) * over * over / (wp.float64(3.0) * m.mu + m.hardening)
 
 
 @wp.func
-def projected_pair(diagonal: wp.float64, off: wp.float64) -> wp.vec2d:
-    """Projection of [[diagonal, off], [off, diagonal]] to positive semidefinite, as (diagonal, off)."""
-    twist = wp.max(diagonal + off, wp.float64(0.0))
-    flip = wp.max(diagonal - off, wp.float64(0.0))
-    return wp.vec2d(wp.float64(0.5) * (twist + flip), wp.float64(0.5) * (twist - flip))
+def hencky_shear(e: wp.vec3d, m: Constants) -> wp.float64:
+    """Secant shear modulus: mu, or what plastic flow leaves of it, Pa."""
+    over = excess_stress(e, m.mu, m.limit)
+    shear = m.mu
+    if over > wp.float64(0.0):
+        share = wp.float64(3.0) * m.mu / (wp.float64(3.0) * m.mu + m.hardening)
+        shear -= m.mu * share * over / equivalent_stress(e, m.mu)
+    return shear
 
 
 @wp.func
-def principal_hessian(s: wp.vec3d, mu: wp.float64, lam: wp.float64):
-    """The projected Hessian of Psi in the frame of the singular vectors.
+def hencky_stress(e: wp.vec3d, shear: wp.float64, m: Constants) -> wp.vec3d:
+    """Principal Kirchhoff stresses dW/de, Pa."""
+    pressure = (m.lam + wp.float64(2.0) / wp.float64(3.0) * m.mu) * (e[0] + e[1] + e[2])
+    return wp.float64(2.0) * shear * deviator(e) + wp.vec3d(pressure, pressure, pressure)
 
-    Smith et al. 2018, section 4: there it splits into a 3x3 block A over the diagonal of F ("scaling") and,
-    for each pair i != j, a 2x2 block [[mu, b_ij], [b_ij, mu]] over (F_ij, F_ji) whose eigenvalues
-    mu +- U'(J) s_k are the twist and flip modes.
+
+@wp.func
+def hencky_quotient(a: wp.float64, b: wp.float64, stress: wp.float64, shear: wp.float64) -> wp.float64:
+    """(P_a - P_b) / (a - b) of two stretches, P = (principal Kirchhoff stress) / stretch, exact as a -> b.
+
+    log(u) / (u - 1) of a rounded u near 1 keeps full precision (Higham 2002, "Accuracy and Stability of
+    Numerical Algorithms", sec. 1.14.1).
+    """
+    u = a / b
+    ratio = wp.float64(1.0)
+    if u != wp.float64(1.0):
+        ratio = u * wp.log(u) / (u - wp.float64(1.0))
+    return (wp.float64(2.0) * shear * ratio - stress) / (a * b)
+
+
+@wp.func
+def hencky_hessian(s: wp.vec3d, m: Constants):
+    """`principal_hessian` of Hencky's law."""
+    e = log_stretches(s)
+    shear = hencky_shear(e, m)
+    tau = hencky_stress(e, shear, m)
+    bulk = m.lam + wp.float64(2.0) / wp.float64(3.0) * m.mu
+    off = bulk - wp.float64(2.0) / wp.float64(3.0) * shear
+    ones = wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
+    H = off * wp.outer(ones, ones) + wp.diag(wp.float64(2.0) * shear * ones - tau)
+    if shear < m.mu:
+        # The radial direction hardens by H alone; the others keep the secant modulus.
+        q = equivalent_stress(e, m.mu)
+        share = wp.float64(3.0) * m.mu / (wp.float64(3.0) * m.mu + m.hardening)
+        n = (ROOT_SIX * m.mu / q) * deviator(e)
+        H -= (wp.float64(2.0) * m.mu * share * m.limit / q) * wp.outer(n, n)
+    inverse = wp.diag(wp.vec3d(wp.float64(1.0) / s[0], wp.float64(1.0) / s[1], wp.float64(1.0) / s[2]))
+    P = inverse * tau
+    p0 = projected_pair(hencky_quotient(s[1], s[2], tau[1], shear), (P[1] + P[2]) / (s[1] + s[2]))
+    p1 = projected_pair(hencky_quotient(s[0], s[2], tau[0], shear), (P[0] + P[2]) / (s[0] + s[2]))
+    p2 = projected_pair(hencky_quotient(s[0], s[1], tau[0], shear), (P[0] + P[1]) / (s[0] + s[1]))
+    return project_symmetric(inverse * H * inverse), wp.matrix_from_rows(p0, p1, p2)
+
+
+# ---- every law ----
+
+
+@wp.func
+def energy_density(F: wp.mat33d, m: Constants) -> wp.float64:
+    """Psi(F), J/m^3; infinite where det F <= 0, but for LINEAR."""
+    if m.law == LINEAR:
+        e = wp.float64(0.5) * (F + wp.transpose(F)) - wp.identity(n=3, dtype=wp.float64)
+        trace = wp.trace(e)
+        return m.mu * wp.ddot(e, e) + wp.float64(0.5) * m.lam * trace * trace
+    J = wp.determinant(F)
+    if J <= wp.float64(0.0):
+        return wp.float64(wp.inf)
+    if m.law == STVK_HENCKY or m.law == COROTATED:
+        _U, s, _V = singular_value_decomposition(F)
+        if m.law == STVK_HENCKY:
+            return hencky_energy(s, m)
+        d = s - wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
+        return m.mu * wp.dot(d, d) + volumetric_energy(J, m)
+    shear = wp.float64(0.5) * m.mu * (wp.ddot(F, F) - wp.float64(3.0))
+    return shear + volumetric_energy(J, m)
+
+
+@wp.func
+def piola_stress_in_frame(F: wp.mat33d, U: wp.mat33d, s: wp.vec3d, V: wp.mat33d, m: Constants) -> wp.mat33d:
+    """First Piola-Kirchhoff stress dPsi/dF, Pa, for F = U diag(s) V^T; LINEAR does not look at the latter."""
+    if m.law == LINEAR:
+        e = wp.float64(0.5) * (F + wp.transpose(F)) - wp.identity(n=3, dtype=wp.float64)
+        return wp.float64(2.0) * m.mu * e + m.lam * wp.trace(e) * wp.identity(n=3, dtype=wp.float64)
+    if m.law == STVK_HENCKY:
+        e_log = log_stretches(s)
+        tau = hencky_stress(e_log, hencky_shear(e_log, m), m)
+        P = wp.diag(wp.vec3d(tau[0] / s[0], tau[1] / s[1], tau[2] / s[2]))
+        return U * P * wp.transpose(V)
+    first, _second = volumetric_derivatives(wp.determinant(F), m)
+    stress = m.mu * F + first * determinant_gradient(F)
+    if m.law == COROTATED:
+        stress += m.mu * F - wp.float64(2.0) * m.mu * (U * wp.transpose(V))
+    return stress
+
+
+@wp.func
+def piola_stress(F: wp.mat33d, m: Constants) -> wp.mat33d:
+    """First Piola-Kirchhoff stress dPsi/dF, Pa, where F is not inverted."""
+    U = wp.identity(n=3, dtype=wp.float64)
+    V = wp.identity(n=3, dtype=wp.float64)
+    s = wp.vec3d()
+    if m.law == COROTATED or m.law == STVK_HENCKY:
+        U, s, V = singular_value_decomposition(F)
+    return piola_stress_in_frame(F, U, s, V, m)
+
+
+@wp.func
+def principal_hessian(s: wp.vec3d, m: Constants):
+    """The projected Hessian of Psi in the frame of the singular vectors; for LINEAR, in that of the axes.
+
+    There it splits into a 3x3 block A over the diagonal of F ("scaling") and, for each pair i != j, a 2x2
+    block over (F_ij, F_ji) with the eigenvalues (P_i - P_j) / (s_i - s_j) ("flip") and
+    (P_i + P_j) / (s_i + s_j) ("twist"), P_i = dPsi/ds_i (Smith et al. 2019).
 
     Returns A (projected) and `pairs`, whose row k holds (diagonal, off) for the pair without axis k.
     """
-    first, second = volumetric_derivatives(s[0] * s[1] * s[2], mu, lam)
+    if m.law == STVK_HENCKY:
+        return hencky_hessian(s, m)
+    if m.law == LINEAR:
+        row = wp.vec2d(m.mu, m.mu)
+        whole = m.lam + wp.float64(2.0) * m.mu
+        # fmt: off
+        B = wp.mat33d(
+            whole, m.lam, m.lam,
+            m.lam, whole, m.lam,
+            m.lam, m.lam, whole,
+        )
+        # fmt: on
+        return B, wp.matrix_from_rows(row, row, row)
+    first, second = volumetric_derivatives(s[0] * s[1] * s[2], m)
+    mu = m.mu
+    less = wp.vec3d()
+    if m.law == COROTATED:
+        mu = wp.float64(2.0) * m.mu
+        turn = wp.float64(4.0) * m.mu
+        less = wp.vec3d(turn / (s[1] + s[2]), turn / (s[0] + s[2]), turn / (s[0] + s[1]))
     c = wp.vec3d(s[1] * s[2], s[2] * s[0], s[0] * s[1])
     a01 = second * c[0] * c[1] + first * s[2]
     a02 = second * c[0] * c[2] + first * s[1]
@@ -109,11 +287,10 @@ def principal_hessian(s: wp.vec3d, mu: wp.float64, lam: wp.float64):
         a02, a12, mu + second * c[2] * c[2],
     )
     # fmt: on
-    p0 = projected_pair(mu, -first * s[0])
-    p1 = projected_pair(mu, -first * s[1])
-    p2 = projected_pair(mu, -first * s[2])
-    pairs = wp.matrix_from_rows(p0, p1, p2)
-    return project_symmetric(A), pairs
+    p0 = projected_pair(mu - first * s[0], mu + first * s[0] - less[0])
+    p1 = projected_pair(mu - first * s[1], mu + first * s[1] - less[1])
+    p2 = projected_pair(mu - first * s[2], mu + first * s[2] - less[2])
+    return project_symmetric(A), wp.matrix_from_rows(p0, p1, p2)
 
 
 @wp.func
@@ -164,8 +341,7 @@ def viscous_stress(F: wp.mat33d, strain: wp.mat33d, mu: wp.float64, lam: wp.floa
 
 
 @wp.func
-def viscous_block(s: wp.vec3d, a: wp.vec3d, b: wp.vec3d, mu: wp.float64, lam: wp.float64) -> wp.mat33d:
-    """Gauss-Newton block (a, b) of `viscous_energy` in the singular frame; positive semidefinite."""
-    S = wp.diag(s)
+def viscous_block(S: wp.mat33d, a: wp.vec3d, b: wp.vec3d, mu: wp.float64, lam: wp.float64) -> wp.mat33d:
+    """Gauss-Newton block (a, b) of `viscous_energy` in a frame where F is S; positive semidefinite."""
     inner = mu * wp.outer(b, a) + lam * wp.outer(a, b) + wp.diag(wp.vec3d(mu * wp.dot(a, b)))
-    return S * inner * S
+    return S * inner * wp.transpose(S)

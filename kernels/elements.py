@@ -2,6 +2,9 @@
 
 F = sum_a x_a (x) grad N_a with constant gradients, the rows of the inverse rest shape matrix. Vertices and
 matrix entries gather what elements wrote, in a fixed order (`gdpro_sim.kernels.fem`).
+
+An element that yields keeps its plastic deformation F_p in its stress-free shape: `inverse_rest` is the
+inverse rest shape matrix times F_p^-1, so that F above is the elastic part, F_e. F_p keeps volume.
 """
 
 from __future__ import annotations
@@ -10,28 +13,37 @@ import warp as wp
 
 from gdpro_sim.kernels.decomposition import singular_value_decomposition
 from gdpro_sim.kernels.elasticity import (
+    LINEAR,
+    STVK_HENCKY,
+    Constants,
     energy_density,
     green_strain_increment,
     piola_stress,
+    piola_stress_in_frame,
     principal_block,
     principal_hessian,
     viscous_block,
     viscous_energy,
     viscous_stress,
 )
+from gdpro_sim.kernels.plasticity import flow
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class Elements:
-    """Constant element data."""
+    """Element data; `inverse_rest` and `plastic_strain` change where elements yield, the rest is constant."""
 
     tets: wp.array[wp.vec4i]
-    inverse_rest: wp.array[wp.mat33d]  # rows are grad N_1..N_3, 1/m
+    inverse_rest: wp.array[wp.mat33d]  # rows are grad N_1..N_3 in the stress-free shape, 1/m
     volume: wp.array[wp.float64]  # m^3, weighted by fill
+    law: wp.array[wp.int32]  # of `gdpro_sim.kernels.elasticity`
     mu: wp.array[wp.float64]  # Pa
     lam: wp.array[wp.float64]  # Pa
+    yield_stress: wp.array[wp.float64]  # Pa, inf: elastic
+    hardening: wp.array[wp.float64]  # Pa
+    plastic_strain: wp.array[wp.float64]  # accumulated
     damping: wp.array[wp.float64]  # Rayleigh stiffness damping, s
 
 
@@ -40,6 +52,20 @@ def deformation_gradient(tet: wp.vec4i, inverse_rest: wp.mat33d, x: wp.array[wp.
     x0 = x[tet[0]]
     edges = wp.matrix_from_cols(x[tet[1]] - x0, x[tet[2]] - x0, x[tet[3]] - x0)
     return edges * inverse_rest
+
+
+@wp.func
+def constants_of(elements: Elements, e: int) -> Constants:
+    m = Constants()
+    m.law = elements.law[e]
+    m.mu = elements.mu[e]
+    m.lam = elements.lam[e]
+    m.limit = wp.float64(wp.inf)
+    m.hardening = wp.float64(0.0)
+    if m.law == STVK_HENCKY:
+        m.hardening = elements.hardening[e]
+        m.limit = elements.yield_stress[e] + m.hardening * elements.plastic_strain[e]
+    return m
 
 
 @wp.kernel
@@ -88,16 +114,18 @@ def element_energy(
     # Out:
     energy_out: wp.array[wp.float64],
 ):
-    """Elastic energy plus damping potential of each element, J. inverse_dt = 0 leaves the damping out."""
+    """Elastic energy plus damping potential of each element, J. inverse_dt = 0 leaves the damping out.
+
+    Where an element yields, what the flow dissipates is in it too.
+    """
     e = start + wp.tid()
     F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
-    mu = elements.mu[e]
-    lam = elements.lam[e]
-    density = energy_density(F, mu, lam)
+    m = constants_of(elements, e)
+    density = energy_density(F, m)
     rate = elements.damping[e] * inverse_dt
     if rate > wp.float64(0.0):
         strain = green_strain_increment(F, cauchy_green[e])
-        density += viscous_energy(strain, rate * mu, rate * lam)
+        density += viscous_energy(strain, rate * m.mu, rate * m.lam)
     energy_out[e] = elements.volume[e] * density
 
 
@@ -106,16 +134,16 @@ def write_forces(
     e: int,
     elements: Elements,
     F: wp.mat33d,
+    stress: wp.mat33d,
+    m: Constants,
     cauchy_green: wp.array[wp.mat33d],
     rate: wp.float64,
     gradient_out: wp.array[wp.vec3d],
 ):
     """The four vectors of an element's gradient; `rate` is its damping over the step, 0 for none."""
-    mu = elements.mu[e]
-    lam = elements.lam[e]
-    P = piola_stress(F, mu, lam)
+    P = stress
     if rate > wp.float64(0.0):
-        P += viscous_stress(F, green_strain_increment(F, cauchy_green[e]), rate * mu, rate * lam)
+        P += viscous_stress(F, green_strain_increment(F, cauchy_green[e]), rate * m.mu, rate * m.lam)
     forces = (elements.volume[e] * P) * wp.transpose(elements.inverse_rest[e])
     f1 = wp.vec3d(forces[0, 0], forces[1, 0], forces[2, 0])
     f2 = wp.vec3d(forces[0, 1], forces[1, 1], forces[2, 1])
@@ -140,7 +168,9 @@ def element_gradient(
     """Gradient (4 vectors) of each element."""
     e = start + wp.tid()
     F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
-    write_forces(e, elements, F, cauchy_green, elements.damping[e] * inverse_dt, gradient_out)
+    m = constants_of(elements, e)
+    rate = elements.damping[e] * inverse_dt
+    write_forces(e, elements, F, piola_stress(F, m), m, cauchy_green, rate, gradient_out)
 
 
 @wp.kernel
@@ -163,13 +193,18 @@ def element_derivatives(
     inverse_rest = elements.inverse_rest[e]
     F = deformation_gradient(elements.tets[e], inverse_rest, x)
     volume = elements.volume[e]
-    mu = elements.mu[e]
-    lam = elements.lam[e]
+    m = constants_of(elements, e)
     rate = elements.damping[e] * inverse_dt
 
-    write_forces(e, elements, F, cauchy_green, rate, gradient_out)
     U, s, V = singular_value_decomposition(F)
-    A, pairs = principal_hessian(s, mu, lam)
+    S = wp.diag(s)
+    if m.law == LINEAR:
+        U = wp.identity(n=3, dtype=wp.float64)
+        V = wp.identity(n=3, dtype=wp.float64)
+        S = F
+    stress = piola_stress_in_frame(F, U, s, V, m)
+    write_forces(e, elements, F, stress, m, cauchy_green, rate, gradient_out)
+    A, pairs = principal_hessian(s, m)
     rotated = inverse_rest * V
     g1 = wp.vec3d(rotated[0, 0], rotated[0, 1], rotated[0, 2])
     g2 = wp.vec3d(rotated[1, 0], rotated[1, 1], rotated[1, 2])
@@ -181,12 +216,14 @@ def element_derivatives(
     k23 = principal_block(A, pairs, g2, g3)
     k33 = principal_block(A, pairs, g3, g3)
     if rate > wp.float64(0.0):
-        k11 += viscous_block(s, g1, g1, rate * mu, rate * lam)
-        k12 += viscous_block(s, g1, g2, rate * mu, rate * lam)
-        k13 += viscous_block(s, g1, g3, rate * mu, rate * lam)
-        k22 += viscous_block(s, g2, g2, rate * mu, rate * lam)
-        k23 += viscous_block(s, g2, g3, rate * mu, rate * lam)
-        k33 += viscous_block(s, g3, g3, rate * mu, rate * lam)
+        mu = rate * m.mu
+        lam = rate * m.lam
+        k11 += viscous_block(S, g1, g1, mu, lam)
+        k12 += viscous_block(S, g1, g2, mu, lam)
+        k13 += viscous_block(S, g1, g3, mu, lam)
+        k22 += viscous_block(S, g2, g2, mu, lam)
+        k23 += viscous_block(S, g2, g3, mu, lam)
+        k33 += viscous_block(S, g3, g3, mu, lam)
     W = volume * U
     Ut = wp.transpose(U)
     k11 = W * k11 * Ut
@@ -209,3 +246,26 @@ def element_derivatives(
     blocks_out[b + 7] = k22
     blocks_out[b + 8] = k23
     blocks_out[b + 9] = k33
+
+
+@wp.kernel
+def element_flow(
+    start: int,
+    # In:
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    # Out:
+    inverse_rest_out: wp.array[wp.mat33d],
+    plastic_strain_out: wp.array[wp.float64],
+):
+    """Moves stress-free shapes to where the stresses at x lie within the yield stress; both outs in place."""
+    e = start + wp.tid()
+    m = constants_of(elements, e)
+    if m.limit < wp.float64(wp.inf):
+        inverse_rest = elements.inverse_rest[e]
+        F = deformation_gradient(elements.tets[e], inverse_rest, x)
+        _U, s, V = singular_value_decomposition(F)
+        G, growth = flow(s, V, m.mu, m.limit, m.hardening)
+        if growth > wp.float64(0.0):
+            inverse_rest_out[e] = inverse_rest * G
+            plastic_strain_out[e] = elements.plastic_strain[e] + growth

@@ -80,6 +80,8 @@ class Model:
     contact_offset: [P] m, how far each vertex lies outside the surface at rest (a lattice overlaps it);
                  it touches the ground that much later
     pinned:      [P] bool, vertices that never move
+    law:         [T] int32 constitutive law, a number of `gdpro_sim.materials.LAWS`; None: stable neo-Hookean
+    yield_stress, hardening: [T] Pa, of elements with the law "stvk_hencky"; inf does not yield; None: none do
     """
 
     bodies: tuple[Body, ...]
@@ -99,6 +101,9 @@ class Model:
     ground: Ground | None
     fem: FemSettings
     device: str = "cpu"
+    law: np.ndarray | None = None
+    yield_stress: np.ndarray | None = None
+    hardening: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

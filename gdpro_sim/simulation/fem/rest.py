@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from gdpro_sim.errors import SolverError
+from gdpro_sim.materials import LAWS
 from gdpro_sim.simulation.model import Model
 
 
@@ -17,6 +18,9 @@ class RestShapes(NamedTuple):
     inverse:      [T, 3, 3] rows are grad N_1..N_3, 1/m
     volume:       [T] m^3, weighted by fill
     mu, lam:      [T] Lame parameters, Pa
+    law:          [T] int32 constitutive law of `gdpro_sim.kernels.elasticity`
+    yield_stress: [T] Pa, inf where the element stays elastic
+    hardening:    [T] Pa
     mass:         [P] kg, a quarter of each element's
     mass_damping: [P] Rayleigh mass damping, 1/s
     stiffness:    [P] N/m, what holds a vertex while its neighbours stay: sum of V (lam + 2 mu) |grad N|^2
@@ -28,6 +32,9 @@ class RestShapes(NamedTuple):
     volume: np.ndarray
     mu: np.ndarray
     lam: np.ndarray
+    law: np.ndarray
+    yield_stress: np.ndarray
+    hardening: np.ndarray
     mass: np.ndarray
     mass_damping: np.ndarray
     stiffness: np.ndarray
@@ -35,7 +42,7 @@ class RestShapes(NamedTuple):
 
 
 def rest_shapes(model: Model) -> RestShapes:
-    """Raises SolverError for an element without volume at rest."""
+    """Raises SolverError for an element without volume at rest, or whose law is none or cannot yield."""
     corners = model.vertices.astype(np.float64)[model.tets]
     shape = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     full_volume = np.linalg.det(shape) / 6.0
@@ -65,7 +72,32 @@ def rest_shapes(model: Model) -> RestShapes:
     stiffness = np.bincount(ids, weights=per_corner.reshape(-1), minlength=count)
     # The element's stiffness is below the sum of its corners', its masses are rho V / 4.
     frequency = float(np.sqrt((4.0 * modulus * squares.sum(1) / density).max(initial=0.0)))
-    return RestShapes(inverse, volume, mu, lam, mass, mass_damping, stiffness, frequency)
+    laws = _laws(model)
+    return RestShapes(inverse, volume, mu, lam, *laws, mass, mass_damping, stiffness, frequency)
+
+
+def _laws(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Law, yield stress and hardening of every element, checked."""
+    count = len(model.tets)
+    law = np.zeros(count, np.int32) if model.law is None else model.law.astype(np.int32)
+    limit = np.full(count, np.inf) if model.yield_stress is None else model.yield_stress.astype(np.float64)
+    hardening = np.zeros(count) if model.hardening is None else model.hardening.astype(np.float64)
+    for bad, problem in (
+        (
+            (law < 0) | (law >= len(LAWS)),
+            f"law must be a number below {len(LAWS)} of gdpro_sim.materials.LAWS",
+        ),
+        (~(limit > 0.0), "yield stress must be > 0 Pa (inf: elastic)"),
+        (~(np.isfinite(hardening) & (hardening >= 0.0)), "hardening must be finite and >= 0 Pa"),
+        (np.isfinite(limit) & (law != LAWS.index("stvk_hencky")), 'only the law "stvk_hencky" can yield'),
+    ):
+        if bad.any():
+            e = int(np.argmax(bad))
+            raise SolverError(
+                f"element {e} has law {law[e]}, yield stress {limit[e]:g} Pa, hardening {hardening[e]:g} Pa: "
+                f"{problem}"
+            )
+    return law, limit, hardening
 
 
 def reals(values: np.ndarray, device: str) -> wp.array:
