@@ -245,7 +245,7 @@ def _row(index: int, diagnostics: Diagnostics, milliseconds: dict[str, float]) -
     units = {
         "time": "time_s", "kinetic_energy": "kinetic_energy_J", "elastic_energy": "elastic_energy_J",
         "gravity_energy": "gravity_energy_J", "contact_energy": "contact_energy_J",
-        "max_penetration": "max_penetration_m",
+        "max_penetration": "max_penetration_m", "force_energy": "force_energy_J",
     }  # fmt: skip
     for key, value in asdict(diagnostics).items():
         if key in ("momentum", "angular_momentum"):

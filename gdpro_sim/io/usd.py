@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any, get_args
@@ -421,8 +421,10 @@ class SimulationReader:
             figures = {}
             for figure in fields(Diagnostics):
                 value = self._root.GetAttribute(_FIGURES + figure.name).Get(code)
-                if value is None:
+                if value is None and figure.default is MISSING:
                     raise AssetError(f"{_FIGURES}{figure.name} is missing")
+                if value is None:  # written before there was such a figure
+                    continue
                 figures[figure.name] = _FIGURE_TYPES[str(figure.type)][2](value)
         return Frame(int(code), self.times[index], bodies, Diagnostics(**figures))
 

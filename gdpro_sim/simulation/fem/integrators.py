@@ -56,14 +56,18 @@ class ImplicitStep:
         time: float,
         dt: float,
         gravity: Any,
+        *,
+        settled: bool = False,
     ) -> None:
+        """`settled`: a pseudo-step towards where forces balance at time + dt; no time passes."""
         if rule == "bdf2" and abs(float(state.dt_before.numpy()[0]) - dt) > 1e-9 * dt:
             rule = "backward-euler"
         self.rule, self.dt = rule, dt
         self._potential, self._state, self._gravity = potential, state, gravity
         h = {"backward-euler": dt, "bdf2": 2.0 * dt / 3.0, "midpoint": 0.5 * dt}[rule]
         reached = time + (0.5 * dt if rule == "midpoint" else dt)
-        self.step = Step(reached, h, state.x, state.v, potential.base, held)
+        start = time + dt if settled else time
+        self.step = Step(reached, h, state.x, state.v, potential.base, held, start, time + dt)
 
     def begin(self, coasting: wp.array, resting: wp.array) -> None:
         """Set up the potential, and two guesses beside its `inertia`: going on as before, and staying."""
@@ -100,6 +104,8 @@ class ImplicitStep:
         if self.rule == "midpoint":
             p.combine(p.trial, 2.0 / h, s.x, -2.0 / h, p.base)
             p.combine(p.base, 1.0, s.v, -1.0, s.v)
+            p.combine(p.inertia, 1.0 / self.dt, s.x, -1.0 / self.dt, p.base)
+            p.hold(p.base, s.v)
             wp.copy(s.x, p.inertia)
         else:
             p.combine(p.trial, 1.0 / h, p.base, -1.0 / h, s.v)

@@ -12,6 +12,7 @@ import warp as wp
 
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import fem
+from gdpro_sim.simulation.fem.forces import force_terms
 from gdpro_sim.simulation.fem.ground import GroundContact
 from gdpro_sim.simulation.fem.integrators import ImplicitStep, State
 from gdpro_sim.simulation.fem.potential import IncrementalPotential
@@ -78,12 +79,18 @@ class SolverFEM:
     def __init__(self, model: Model) -> None:
         self.model = model
         rest = rest_shapes(model)
-        self.terms: tuple[Term, ...] = () if model.ground is None else (GroundContact(model, rest),)
+        floor: tuple[Term, ...] = () if model.ground is None else (GroundContact(model, rest),)
+        self.terms: tuple[Term, ...] = (*force_terms(model, rest), *floor)
         self._potential = IncrementalPotential(model, rest, self.terms)
-        self._rigid = RigidModes(model.tets, self._potential.mass, self._potential.fixed)
+        self._rigid_fixed = self._potential.fixed
+        self._rigid = RigidModes(model.tets, self._potential.mass, self._rigid_fixed)
         self._rest = model.vertices.astype(np.float64)
         self._gravity = wp.vec3d(*model.gravity)
-        frequency = math.hypot(rest.frequency, *(term.frequency for term in self.terms))
+        # Symplectic Euler with damping b w^2: W^2 = b w^2 W + w^2 (criterion of Jury).
+        damped = float(np.max(model.rayleigh_stiffness, initial=0.0)) * rest.frequency**2
+        damped += float(np.max(model.rayleigh_mass, initial=0.0))
+        elastic = 0.5 * (damped + math.hypot(damped, 2.0 * rest.frequency))
+        frequency = math.hypot(elastic, *(term.frequency for term in self.terms))
         self._explicit_dt = 2.0 * EXPLICIT_SAFETY / max(frequency, 1e-30)
         count = len(model.vertices)
         self._state = State(count, model.device)
@@ -228,8 +235,10 @@ class SolverFEM:
             )
         h = dt / count
         for _ in range(count):
-            step = Step(self._time + h, h, state.x, state.v, p.base, self._held)
+            end = self._time + h
+            step = Step(end, h, state.x, state.v, p.base, self._held, self._time, end)
             wp.copy(self._held, state.x)
+            p.combine(state.x, 1.0, state.v, -h, p.base)
             p.begin(step)
             # Strain rates over the step before: C now less C then, over its length.
             known = float(state.dt_before.numpy()[0]) > 0.0
@@ -247,6 +256,8 @@ class SolverFEM:
                     f"an explicit step of {h:.3g} s at t = {self._time:.6g} s would pass through something; "
                     "use an implicit integrator, or raise the substeps"
                 )
+            p.combine(p.trial, 1.0 / h, state.x, -1.0 / h, p.base)
+            p.hold(p.base, state.v)
             wp.copy(state.x, p.trial)
             state.dt_before.fill_(h)
             for term in p.terms:
@@ -264,8 +275,14 @@ class SolverFEM:
     ) -> tuple[ImplicitStep, _Outcome]:
         """Projected Newton on the incremental potential; leaves the result in the potential's trial."""
         when = self._time if time is None else time
-        step = ImplicitStep(rule, self._potential, self._state, self._held, when, dt, self._gravity)
+        settled = time is not None
+        step = ImplicitStep(
+            rule, self._potential, self._state, self._held, when, dt, self._gravity, settled=settled
+        )
         step.begin(self._coasting, self._resting)
+        if self._rigid_fixed is not self._potential.fixed:  # pins let go
+            self._rigid_fixed = self._potential.fixed
+            self._rigid = RigidModes(self.model.tets, self._potential.mass, self._rigid_fixed)
         return step, self._newton(step.step.h)
 
     def _newton(self, h: float) -> _Outcome:
@@ -393,13 +410,16 @@ class SolverFEM:
         momentum = (mass * v).sum(axis=0)
         angular = (mass * np.cross(x, v)).sum(axis=0)
         reports = [term.report(self._state.x) for term in self.terms]
+        stored: dict[bool, list[float]] = {True: [], False: []}
+        for term, report in zip(self.terms, reports, strict=True):
+            stored["contacts" in report].append(term.stored(self._state.x))
         c = self._counters
         return Diagnostics(
             time=self._time,
             kinetic_energy=float(0.5 * (mass * v * v).sum()),
             elastic_energy=potential.elastic_energy(self._state.x),
             gravity_energy=float(-(mass * x).sum(axis=0) @ np.asarray(self.model.gravity, dtype=np.float64)),
-            contact_energy=sum(term.stored(self._state.x) for term in self.terms),
+            contact_energy=sum(stored[True]),
             momentum=(float(momentum[0]), float(momentum[1]), float(momentum[2])),
             angular_momentum=(float(angular[0]), float(angular[1]), float(angular[2])),
             contacts=int(sum(report.get("contacts", 0.0) for report in reports)),
@@ -410,6 +430,7 @@ class SolverFEM:
             cg_iterations=c.cg_iterations,
             converged=c.converged,
             residual=c.residual,
+            force_energy=sum(stored[False]),
         )
 
     def _assign(self, values: dict[str, np.ndarray]) -> None:

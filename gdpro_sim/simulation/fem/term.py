@@ -18,6 +18,7 @@ class Step:
     x, v:  [P] vec3d state at the start of the step, m and m/s
     base:  [P] vec3d m
     held:  [P] vec3d m, where fixed vertices are to be at `time`; a term that moves them writes here
+    start, end: s, the whole step that this solve belongs to; equal where there is no inertia
     """
 
     time: float
@@ -26,6 +27,8 @@ class Step:
     v: wp.array
     base: wp.array
     held: wp.array
+    start: float = 0.0
+    end: float = 0.0
 
 
 class Term(Protocol):

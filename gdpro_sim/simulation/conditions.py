@@ -1,0 +1,101 @@
+"""Boundary conditions and loads of a compiled scene: constant arrays, SI units, world space.
+
+Vertex ids and triangles are those of `Model.vertices`; triangles are outward boundary triangles of the tets.
+Loads act from `start` to `end` in s; a step takes the share of it that they act.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+FOREVER = math.inf
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Pinned vertices that move as one rigid body: turned about `pivot`, then shifted.
+
+    vertices:     [n] int32
+    pivot:        [3] m
+    times:        [K] s, ascending from 0
+    translations: [K, 3] m, from where they start; linear in between
+    rotations:    [K, 3] rad, rotation vectors: about one axis in between where two have one axis, which may
+                  be more than a full turn, else along the shortest way; the first of both are 0
+    """
+
+    vertices: np.ndarray
+    pivot: np.ndarray
+    times: np.ndarray
+    translations: np.ndarray
+    rotations: np.ndarray
+
+
+@dataclass(frozen=True)
+class Springs:
+    """Springs with dashpots between two ends: weighted corners of an element, plus a point of the world.
+
+    corners:     [S, 2, 4] int32
+    weights:     [S, 2, 4] sum to 1; all 0 for an end that is a point of the world
+    anchors:     [S, 2, 3] m; 0 for an end on a body
+    stiffness:   [S] N/m
+    rest_length: [S] m; 0 pulls the ends together
+    damping:     [S] N s/m
+    """
+
+    corners: np.ndarray
+    weights: np.ndarray
+    anchors: np.ndarray
+    stiffness: np.ndarray
+    rest_length: np.ndarray
+    damping: np.ndarray
+
+
+@dataclass(frozen=True)
+class Force:
+    """Constant forces [n, 3] N on vertices [n]."""
+
+    vertices: np.ndarray
+    forces: np.ndarray
+    start: float = 0.0
+    end: float = FOREVER
+
+
+@dataclass(frozen=True)
+class Impulse:
+    """Impulses [n, 3] N s on vertices [n], all in the step that holds `time`."""
+
+    vertices: np.ndarray
+    impulses: np.ndarray
+    time: float
+
+
+@dataclass(frozen=True)
+class Pressure:
+    """Pressure in Pa on triangles [F, 3], inward where positive; `closed` where they enclose a volume."""
+
+    faces: np.ndarray
+    pressure: float
+    closed: bool
+    start: float = 0.0
+    end: float = FOREVER
+
+
+@dataclass(frozen=True)
+class Wind:
+    """Air of `density` kg/m^3 that moves at `velocity` m/s, on triangles [F, 3] that face it."""
+
+    faces: np.ndarray
+    velocity: tuple[float, float, float]
+    density: float
+    drag: float
+    lift: float
+    start: float = 0.0
+    end: float = FOREVER
+
+
+Load = Force | Impulse | Pressure | Wind
+
+__all__ = ["FOREVER", "Force", "Impulse", "Load", "Motion", "Pressure", "Springs", "Wind"]

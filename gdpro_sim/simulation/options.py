@@ -1,0 +1,19 @@
+"""What every part of a scene description shares."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Vector = tuple[Number, Number, Number]
+
+
+class Options(BaseModel):
+    """A part of a scene description: unknown keys, infinity and NaN are refused; constant."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+__all__ = ["Number", "Options", "Vector"]

@@ -1,0 +1,110 @@
+"""Parts of a body, chosen by a box, a sphere, a side or vertex ids, where the body stands at the start."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from gdpro_sim.simulation.options import Options, Vector
+
+SIDES: dict[str, tuple[int, bool]] = {
+    "left": (0, False),
+    "right": (0, True),
+    "front": (1, False),
+    "back": (1, True),
+    "bottom": (2, False),
+    "top": (2, True),
+}
+"""Axis of each side, and whether it lies at the upper end: a viewer looks along +Y, X points right."""
+
+
+class Region(Options):
+    """Vertices of a body's tets in world space at the start: give one of box, sphere, side, vertices."""
+
+    minimum: Vector | None = Field(default=None, description="lower corner of a box, m; default: no limit")
+    maximum: Vector | None = Field(default=None, description="upper corner of a box, m; default: no limit")
+    center: Vector | None = Field(default=None, description="centre of a sphere, m")
+    radius: float | None = Field(default=None, gt=0.0, description="radius of the sphere, m")
+    side: Literal["bottom", "top", "left", "right", "front", "back"] | None = Field(
+        default=None, description="left/right are -X/+X, front/back -Y/+Y, bottom/top -Z/+Z of the body"
+    )
+    fraction: float | None = Field(
+        default=None, gt=0.0, le=1.0, description="of the body's extent that a side reaches in; default 0.05"
+    )
+    vertices: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
+        default=None, min_length=1, description="ids of the body's tet vertices, from 0"
+    )
+
+    @field_validator("maximum")
+    @classmethod
+    def _ordered(cls, value: Any, info: Any) -> Any:
+        low = info.data.get("minimum")
+        if value is not None and low is not None and any(b < a for a, b in zip(low, value, strict=True)):
+            raise ValueError(f"must not lie below minimum {list(low)}, got {list(value)}")
+        return value
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Region:
+        if (self.center is None) != (self.radius is None):
+            raise ValueError("a sphere needs both `center` and `radius`")
+        if self.fraction is not None and self.side is None:
+            raise ValueError("`fraction` belongs to a `side`")
+        if len(self._kinds()) > 1:
+            raise ValueError(f"give one of box, sphere, side and vertices, got {' and '.join(self._kinds())}")
+        return self
+
+    def _kinds(self) -> list[str]:
+        given = {
+            "a box": self.minimum is not None or self.maximum is not None,
+            "a sphere": self.center is not None,
+            "a side": self.side is not None,
+            "vertices": self.vertices is not None,
+        }
+        return [kind for kind, present in given.items() if present]
+
+    @property
+    def chosen(self) -> bool:
+        """Whether anything is given; if not, the region is the whole body."""
+        return bool(self._kinds())
+
+    def describe(self) -> str:
+        """In words, for messages."""
+        if self.side is not None:
+            return f"{self.side} side"
+        if self.center is not None:
+            return f"sphere of {self.radius:g} m at {list(self.center)}"
+        if self.vertices is not None:
+            return "list of vertices"
+        return "box" if self.chosen else "whole body"
+
+    def select(self, points: np.ndarray) -> np.ndarray:
+        """[n] bool: which of `points` [n, 3] m lie inside.
+
+        Raises IndexError with the id where an explicit vertex is none of them.
+        """
+        if self.side is not None:
+            axis, upper = SIDES[self.side]
+            along = points[:, axis]
+            low, high = float(along.min()), float(along.max())
+            depth = (0.05 if self.fraction is None else self.fraction) * (high - low)
+            slack = 1e-9 * (high - low)
+            return along >= high - depth - slack if upper else along <= low + depth + slack
+        if self.center is not None and self.radius is not None:
+            return np.linalg.norm(points - np.asarray(self.center), axis=1) <= self.radius
+        inside = np.zeros(len(points), bool)
+        if self.vertices is not None:
+            if max(self.vertices) >= len(points):
+                raise IndexError(max(self.vertices))
+            inside[list(self.vertices)] = True
+            return inside
+        inside[:] = True
+        if self.minimum is not None:
+            inside &= np.all(points >= self.minimum, axis=1)
+        if self.maximum is not None:
+            inside &= np.all(points <= self.maximum, axis=1)
+        return inside
+
+
+__all__ = ["SIDES", "Region"]
