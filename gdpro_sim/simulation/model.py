@@ -9,6 +9,7 @@ import numpy as np
 
 from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.meshing.tetmesh import Embedding
+from gdpro_sim.simulation.conditions import Load, Motion, Springs
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,9 @@ class FemSettings:
     cg_tolerance:      relative (preconditioned) residual of the inner conjugate gradients
     contact_stiffness: multiple of the ground penalty stiffness that the solver derives from each body's
                        own elasticity and weight
+    contact_gap:       distance that contact between bodies keeps, as a fraction of the smallest body's size
+    body_contact:      whether bodies collide with each other
+    self_contact:      whether bodies collide with themselves; needs body_contact
     """
 
     integrator: Integrator = "backward-euler"
@@ -65,6 +69,9 @@ class FemSettings:
     cg_iterations: int = 2000
     cg_tolerance: float = 1e-2
     contact_stiffness: float = 1.0
+    contact_gap: float = 1e-3
+    body_contact: bool = True
+    self_contact: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,9 @@ class Model:
     friction:    [P] Coulomb coefficient of each vertex against the ground
     contact_offset: [P] m, how far each vertex lies outside the surface at rest (a lattice overlaps it);
                  it touches the ground that much later
-    pinned:      [P] bool, vertices that never move
+    pinned:      [P] bool, vertices that are held where they are, or where `motions` take them
+    release:     [P] s, when a pinned vertex is let go, inf for never; None: none is
+    motions, springs, loads: see `gdpro_sim.simulation.conditions`
     law:         [T] int32 constitutive law, a number of `gdpro_sim.materials.LAWS`; None: stable neo-Hookean
     yield_stress, hardening: [T] Pa, of elements with the law "stvk_hencky"; inf does not yield; None: none do
     """
@@ -104,11 +113,18 @@ class Model:
     law: np.ndarray | None = None
     yield_stress: np.ndarray | None = None
     hardening: np.ndarray | None = None
+    release: np.ndarray | None = None
+    motions: tuple[Motion, ...] = ()
+    springs: Springs | None = None
+    loads: tuple[Load, ...] = ()
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What a solver reports about its last `step`. Energies in J, momentum in kg m/s, SI throughout."""
+    """What a solver reports about its last `step`. Energies in J, momentum in kg m/s, SI throughout.
+
+    force_energy: held by springs, and by pressure on closed surfaces
+    """
 
     time: float
     kinetic_energy: float
@@ -125,6 +141,7 @@ class Diagnostics:
     cg_iterations: int
     converged: bool
     residual: float
+    force_energy: float = 0.0
 
 
 @runtime_checkable
