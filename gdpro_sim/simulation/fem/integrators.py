@@ -110,6 +110,7 @@ class ImplicitStep:
         else:
             p.combine(p.trial, 1.0 / h, p.base, -1.0 / h, s.v)
             wp.copy(s.x, p.trial)
+        p.flow(s.x)
         return True
 
 

@@ -40,7 +40,9 @@ class IncrementalPotential:
         device, p, t = self.device, self.vertex_count, self.element_count
         self.terms = terms
         self.mass = rest.mass
-        self.fixed = model.pinned | (rest.mass <= 0.0)
+        self._pinned, self._massless = model.pinned, rest.mass <= 0.0
+        self._release = model.release
+        self.fixed = self._pinned | self._massless
         self.energy_noise = 2.0e-16 * float(np.sum(rest.volume * (rest.lam + 2.0 * rest.mu)))
 
         topology = build_topology(model.tets, p)
@@ -86,6 +88,7 @@ class IncrementalPotential:
         ]
         self._pair_count = len(topology.upper)
         self._damped = bool(np.any(model.rayleigh_stiffness > 0.0))
+        self._yields = bool(np.any(np.isfinite(rest.yield_stress)))
         self._inverse_h = 0.0
 
     def begin(self, step: Step) -> None:
@@ -94,8 +97,18 @@ class IncrementalPotential:
         Fixed vertices of `inertia` are to be put where they are held after that.
         """
         self._inverse_h = 1.0 / step.h
+        if self._release is not None:
+            self._let_go(step.end)
         for term in self.terms:
             term.begin(step)
+
+    def _let_go(self, time: float) -> None:
+        """Fix the pinned vertices that are not to be released before `time`."""
+        assert self._release is not None
+        fixed = (self._pinned & (time <= self._release + 1e-9)) | self._massless
+        if not np.array_equal(fixed, self.fixed):
+            self.fixed = fixed
+            self.vertices.fixed.assign(fixed.astype(np.int32))
 
     def strain_base(self, a: wp.array, weight_a: float, b: wp.array, weight_b: float) -> None:
         """Measure strain rates from weight_a C(a) + weight_b C(b), C = F^T F."""
@@ -225,6 +238,21 @@ class IncrementalPotential:
         inputs = [self.elements, x, self._cauchy_green, 0.0]
         self.over_elements(elements.element_energy, inputs, [self._energies])
         return float(self._energies.numpy()[: self.element_count].sum())
+
+    def flow(self, x: wp.array) -> None:
+        """Let elements past their yield stress keep the plastic part of their deformation at x."""
+        if self._yields:
+            outputs = [self.elements.inverse_rest, self.elements.plastic_strain]
+            self.over_elements(elements.element_flow, [self.elements, x], outputs)
+
+    def state(self) -> dict[str, wp.array]:
+        """Arrays that `flow` changes; none where nothing can yield."""
+        if not self._yields:
+            return {}
+        return {
+            "stress_free_shapes": self.elements.inverse_rest,
+            "plastic_strain": self.elements.plastic_strain,
+        }
 
     def smallest_volume_ratio(self, x: wp.array) -> float:
         """min over elements of det F at x."""

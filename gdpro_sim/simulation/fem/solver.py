@@ -98,7 +98,7 @@ class SolverFEM:
         self._coasting, self._resting, self._held = (
             wp.zeros(count, dtype=wp.vec3d, device=model.device) for _ in range(3)
         )
-        self._changing = self._state.arrays()
+        self._changing = self._state.arrays() | self._potential.state()
         for k, term in enumerate(self.terms):
             self._changing.update({f"terms.{k}.{name}": array for name, array in term.state().items()})
         self._saved = {name: wp.clone(array) for name, array in self._changing.items()}
@@ -263,6 +263,7 @@ class SolverFEM:
             state.dt_before.fill_(h)
             for term in p.terms:
                 term.finish(state.x)
+            p.flow(state.x)
             self._time += h
         if not math.isfinite(p.elastic_energy(state.x)):
             raise SolverError(
