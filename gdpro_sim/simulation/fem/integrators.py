@@ -6,8 +6,9 @@ Implicit rules solve M (x - y) / h^2 = forces(x), velocities (x - base) / h, wit
     bdf2            h = 2 dt/3  base = (4 x_n - x_{n-1}) / 3   y = base + h (4 v_n - v_{n-1}) / 3 + h^2 g
     midpoint        h = dt/2    as backward Euler, to the middle of the step; then x_{n+1} = 2 x - x_n
 
-BDF2 starts, and restarts wherever the step length changes, with one step of backward Euler. Sources: Hairer &
-Wanner, "Solving Ordinary Differential Equations II", 2nd ed., eq. III.1.22' (BDF2) and IV.3 (midpoint).
+BDF2 starts, and restarts where the step length changes or pins let go, with one step of backward Euler.
+Sources: Hairer & Wanner, "Solving Ordinary Differential Equations II", 2nd ed., eq. III.1.22' (BDF2) and
+IV.3 (midpoint).
 """
 
 from __future__ import annotations
@@ -60,7 +61,9 @@ class ImplicitStep:
         settled: bool = False,
     ) -> None:
         """`settled`: a pseudo-step towards where forces balance at time + dt; no time passes."""
-        if rule == "bdf2" and abs(float(state.dt_before.numpy()[0]) - dt) > 1e-9 * dt:
+        if rule == "bdf2" and (
+            abs(float(state.dt_before.numpy()[0]) - dt) > 1e-9 * dt or potential.lets_go(time, time + dt)
+        ):
             rule = "backward-euler"
         self.rule, self.dt = rule, dt
         self._potential, self._state, self._gravity = potential, state, gravity

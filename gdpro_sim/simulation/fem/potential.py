@@ -97,18 +97,22 @@ class IncrementalPotential:
         Fixed vertices of `inertia` are to be put where they are held after that.
         """
         self._inverse_h = 1.0 / step.h
-        if self._release is not None:
-            self._let_go(step.end)
-        for term in self.terms:
-            term.begin(step)
-
-    def _let_go(self, time: float) -> None:
-        """Fix the pinned vertices that are not to be released before `time`."""
-        assert self._release is not None
-        fixed = (self._pinned & (time <= self._release + 1e-9)) | self._massless
+        fixed = self._fixed_until(step.end)
         if not np.array_equal(fixed, self.fixed):
             self.fixed = fixed
             self.vertices.fixed.assign(fixed.astype(np.int32))
+        for term in self.terms:
+            term.begin(step)
+
+    def lets_go(self, start: float, end: float) -> bool:
+        """Whether a step from `start` to `end` s is the first after a pin's release."""
+        return not np.array_equal(self._fixed_until(start), self._fixed_until(end))
+
+    def _fixed_until(self, time: float) -> np.ndarray:
+        """[P] bool: vertices without mass, and pins that are not let go before `time` s."""
+        if self._release is None:
+            return self.fixed
+        return (self._pinned & (time <= self._release + 1e-9)) | self._massless
 
     def strain_base(self, a: wp.array, weight_a: float, b: wp.array, weight_b: float) -> None:
         """Measure strain rates from weight_a C(a) + weight_b C(b), C = F^T F."""
