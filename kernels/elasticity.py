@@ -55,6 +55,7 @@ class Constants:
     lam: wp.float64
     limit: wp.float64  # present yield stress, Pa; inf: elastic. STVK_HENCKY alone yields
     hardening: wp.float64  # growth of the yield stress with plastic strain, Pa
+    pressure: wp.float64  # Pa, added to dPsi/dJ in stress and Hessian, not in the energy; LINEAR takes none
 
 
 @wp.func
@@ -188,10 +189,17 @@ def hencky_hessian(s: wp.vec3d, m: Constants):
         H -= (wp.float64(2.0) * m.mu * share * m.limit / q) * wp.outer(n, n)
     inverse = wp.diag(wp.vec3d(wp.float64(1.0) / s[0], wp.float64(1.0) / s[1], wp.float64(1.0) / s[2]))
     P = inverse * tau
-    p0 = projected_pair(hencky_quotient(s[1], s[2], tau[1], shear), (P[1] + P[2]) / (s[1] + s[2]))
-    p1 = projected_pair(hencky_quotient(s[0], s[2], tau[0], shear), (P[0] + P[2]) / (s[0] + s[2]))
-    p2 = projected_pair(hencky_quotient(s[0], s[1], tau[0], shear), (P[0] + P[1]) / (s[0] + s[1]))
-    return project_symmetric(inverse * H * inverse), wp.matrix_from_rows(p0, p1, p2)
+    more = m.pressure * s
+    flip0 = hencky_quotient(s[1], s[2], tau[1], shear) - more[0]
+    flip1 = hencky_quotient(s[0], s[2], tau[0], shear) - more[1]
+    flip2 = hencky_quotient(s[0], s[1], tau[0], shear) - more[2]
+    p0 = projected_pair(flip0, (P[1] + P[2]) / (s[1] + s[2]) + more[0])
+    p1 = projected_pair(flip1, (P[0] + P[2]) / (s[0] + s[2]) + more[1])
+    p2 = projected_pair(flip2, (P[0] + P[1]) / (s[0] + s[1]) + more[2])
+    zero = wp.float64(0.0)
+    A = inverse * H * inverse
+    A += wp.mat33d(zero, more[2], more[1], more[2], zero, more[0], more[1], more[0], zero)
+    return project_symmetric(A), wp.matrix_from_rows(p0, p1, p2)
 
 
 # ---- every law ----
@@ -227,9 +235,9 @@ def piola_stress_in_frame(F: wp.mat33d, U: wp.mat33d, s: wp.vec3d, V: wp.mat33d,
         e_log = log_stretches(s)
         tau = hencky_stress(e_log, hencky_shear(e_log, m), m)
         P = wp.diag(wp.vec3d(tau[0] / s[0], tau[1] / s[1], tau[2] / s[2]))
-        return U * P * wp.transpose(V)
+        return U * P * wp.transpose(V) + m.pressure * determinant_gradient(F)
     first, _second = volumetric_derivatives(wp.determinant(F), m)
-    stress = m.mu * F + first * determinant_gradient(F)
+    stress = m.mu * F + (first + m.pressure) * determinant_gradient(F)
     if m.law == COROTATED:
         stress += m.mu * F - wp.float64(2.0) * m.mu * (U * wp.transpose(V))
     return stress
@@ -270,6 +278,7 @@ def principal_hessian(s: wp.vec3d, m: Constants):
         # fmt: on
         return B, wp.matrix_from_rows(row, row, row)
     first, second = volumetric_derivatives(s[0] * s[1] * s[2], m)
+    first += m.pressure
     mu = m.mu
     less = wp.vec3d()
     if m.law == COROTATED:
@@ -291,29 +300,6 @@ def principal_hessian(s: wp.vec3d, m: Constants):
     p1 = projected_pair(mu - first * s[1], mu + first * s[1] - less[1])
     p2 = projected_pair(mu - first * s[2], mu + first * s[2] - less[2])
     return project_symmetric(A), wp.matrix_from_rows(p0, p1, p2)
-
-
-@wp.func
-def principal_block(
-    A: wp.mat33d,
-    pairs: wp.types.matrix(shape=(3, 2), dtype=wp.float64),
-    a: wp.vec3d,
-    b: wp.vec3d,
-) -> wp.mat33d:
-    """Block (a, b) of the element Hessian in the singular frame, for rotated shape gradients V^T grad N."""
-    # fmt: off
-    return wp.mat33d(
-        A[0, 0] * a[0] * b[0] + pairs[2, 0] * a[1] * b[1] + pairs[1, 0] * a[2] * b[2],
-        A[0, 1] * a[0] * b[1] + pairs[2, 1] * a[1] * b[0],
-        A[0, 2] * a[0] * b[2] + pairs[1, 1] * a[2] * b[0],
-        A[0, 1] * a[1] * b[0] + pairs[2, 1] * a[0] * b[1],
-        A[1, 1] * a[1] * b[1] + pairs[2, 0] * a[0] * b[0] + pairs[0, 0] * a[2] * b[2],
-        A[1, 2] * a[1] * b[2] + pairs[0, 1] * a[2] * b[1],
-        A[0, 2] * a[2] * b[0] + pairs[1, 1] * a[0] * b[2],
-        A[1, 2] * a[2] * b[1] + pairs[0, 1] * a[1] * b[2],
-        A[2, 2] * a[2] * b[2] + pairs[1, 0] * a[0] * b[0] + pairs[0, 0] * a[1] * b[1],
-    )
-    # fmt: on
 
 
 @wp.func
@@ -341,7 +327,17 @@ def viscous_stress(F: wp.mat33d, strain: wp.mat33d, mu: wp.float64, lam: wp.floa
 
 
 @wp.func
-def viscous_block(S: wp.mat33d, a: wp.vec3d, b: wp.vec3d, mu: wp.float64, lam: wp.float64) -> wp.mat33d:
-    """Gauss-Newton block (a, b) of `viscous_energy` in a frame where F is S; positive semidefinite."""
-    inner = mu * wp.outer(b, a) + lam * wp.outer(a, b) + wp.diag(wp.vec3d(mu * wp.dot(a, b)))
-    return S * inner * wp.transpose(S)
+def viscous_hessian(s: wp.vec3d, mu: wp.float64, lam: wp.float64):
+    """Gauss-Newton Hessian of `viscous_energy` in the frame of the singular vectors, positive semidefinite.
+
+    Returns A and, in row k of `pairs`, the entries (F_ij, F_ij), (F_ji, F_ji) and (F_ij, F_ji) for the pair
+    i < j without axis k.
+    """
+    squares = wp.cw_mul(s, s)
+    A = lam * wp.outer(s, s) + wp.float64(2.0) * mu * wp.diag(squares)
+    pairs = mu * wp.matrix_from_rows(
+        wp.vec3d(squares[1], squares[2], s[1] * s[2]),
+        wp.vec3d(squares[0], squares[2], s[0] * s[2]),
+        wp.vec3d(squares[0], squares[1], s[0] * s[1]),
+    )
+    return A, pairs

@@ -13,6 +13,7 @@ import warp as wp
 
 from gdpro_sim.kernels.decomposition import singular_value_decomposition
 from gdpro_sim.kernels.elasticity import (
+    COROTATED,
     LINEAR,
     STVK_HENCKY,
     Constants,
@@ -20,15 +21,30 @@ from gdpro_sim.kernels.elasticity import (
     green_strain_increment,
     piola_stress,
     piola_stress_in_frame,
-    principal_block,
     principal_hessian,
-    viscous_block,
     viscous_energy,
+    viscous_hessian,
     viscous_stress,
 )
+from gdpro_sim.kernels.element_lanes import (
+    A_SLOT,
+    F_SLOT,
+    G_SLOT,
+    PAIR_SLOT,
+    S_SLOT,
+    U_SLOT,
+    V_SLOT,
+    WORK,
+    decompose_group,
+    read_matrix,
+    read_vector,
+    write_blocks_group,
+    write_matrix,
+)
+from gdpro_sim.kernels.lanes import CPU_FLAGS
 from gdpro_sim.kernels.plasticity import flow
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 
 
 @wp.struct
@@ -44,6 +60,7 @@ class Elements:
     yield_stress: wp.array[wp.float64]  # Pa, inf: elastic
     hardening: wp.array[wp.float64]  # Pa
     plastic_strain: wp.array[wp.float64]  # accumulated
+    pressure: wp.array[wp.float64]  # Pa, added to dPsi/dJ; not in the energy
     damping: wp.array[wp.float64]  # Rayleigh stiffness damping, s
 
 
@@ -62,6 +79,7 @@ def constants_of(elements: Elements, e: int) -> Constants:
     m.lam = elements.lam[e]
     m.limit = wp.float64(wp.inf)
     m.hardening = wp.float64(0.0)
+    m.pressure = elements.pressure[e]
     if m.law == STVK_HENCKY:
         m.hardening = elements.hardening[e]
         m.limit = elements.yield_stress[e] + m.hardening * elements.plastic_strain[e]
@@ -173,79 +191,75 @@ def element_gradient(
     write_forces(e, elements, F, piola_stress(F, m), m, cauchy_green, rate, gradient_out)
 
 
+@wp.func
+def write_law(
+    e: int,
+    at: int,
+    lanes: int,
+    elements: Elements,
+    cauchy_green: wp.array[wp.mat33d],
+    inverse_dt: wp.float64,
+    work_out: wp.array[wp.float64],
+    gradient_out: wp.array[wp.vec3d],
+):
+    """Gradient of element e, and its projected Hessian in the frame of the singular vectors."""
+    m = constants_of(elements, e)
+    rate = elements.damping[e] * inverse_dt
+    F = read_matrix(work_out, at, lanes, F_SLOT)
+    s = read_vector(work_out, at, lanes, S_SLOT)
+    U = wp.mat33d()
+    V = wp.mat33d()
+    if m.law == COROTATED or m.law == STVK_HENCKY:
+        U = read_matrix(work_out, at, lanes, U_SLOT)
+        V = read_matrix(work_out, at, lanes, V_SLOT)
+    stress = piola_stress_in_frame(F, U, s, V, m)
+    write_forces(e, elements, F, stress, m, cauchy_green, rate, gradient_out)
+    A, halves = principal_hessian(s, m)
+    pairs = wp.matrix_from_rows(
+        wp.vec3d(halves[0, 0], halves[0, 0], halves[0, 1]),
+        wp.vec3d(halves[1, 0], halves[1, 0], halves[1, 1]),
+        wp.vec3d(halves[2, 0], halves[2, 0], halves[2, 1]),
+    )
+    if m.law == LINEAR:
+        s = wp.vec3d(wp.float64(1.0))  # strains are small
+        write_matrix(wp.identity(n=3, dtype=wp.float64), at, lanes, U_SLOT, work_out)
+        write_matrix(elements.inverse_rest[e], at, lanes, G_SLOT, work_out)
+    if rate > wp.float64(0.0):
+        viscous, viscous_pairs = viscous_hessian(s, rate * m.mu, rate * m.lam)
+        A += viscous
+        pairs += viscous_pairs
+    write_matrix(A, at, lanes, A_SLOT, work_out)
+    write_matrix(pairs, at, lanes, PAIR_SLOT, work_out)
+
+
 @wp.kernel
 def element_derivatives(
     start: int,
     # In:
+    lanes: int,
+    count: int,
     elements: Elements,
     x: wp.array[wp.vec3d],
     cauchy_green: wp.array[wp.mat33d],
     inverse_dt: wp.float64,
+    # Work:
+    work_out: wp.array[wp.float64],
     # Out:
     gradient_out: wp.array[wp.vec3d],
     blocks_out: wp.array[wp.mat33d],
 ):
     """Gradient (4 vectors) and projected Hessian (10 blocks, a <= b, row by row) of each element.
 
-    Shape gradients sum to zero, so the blocks of corner 0 follow from the six of corners 1 to 3.
+    The index is a group of `lanes` of the `count` elements, see `gdpro_sim.kernels.element_lanes`.
     """
-    e = start + wp.tid()
-    inverse_rest = elements.inverse_rest[e]
-    F = deformation_gradient(elements.tets[e], inverse_rest, x)
-    volume = elements.volume[e]
-    m = constants_of(elements, e)
-    rate = elements.damping[e] * inverse_dt
-
-    U, s, V = singular_value_decomposition(F)
-    S = wp.diag(s)
-    if m.law == LINEAR:
-        U = wp.identity(n=3, dtype=wp.float64)
-        V = wp.identity(n=3, dtype=wp.float64)
-        S = F
-    stress = piola_stress_in_frame(F, U, s, V, m)
-    write_forces(e, elements, F, stress, m, cauchy_green, rate, gradient_out)
-    A, pairs = principal_hessian(s, m)
-    rotated = inverse_rest * V
-    g1 = wp.vec3d(rotated[0, 0], rotated[0, 1], rotated[0, 2])
-    g2 = wp.vec3d(rotated[1, 0], rotated[1, 1], rotated[1, 2])
-    g3 = wp.vec3d(rotated[2, 0], rotated[2, 1], rotated[2, 2])
-    k11 = principal_block(A, pairs, g1, g1)
-    k12 = principal_block(A, pairs, g1, g2)
-    k13 = principal_block(A, pairs, g1, g3)
-    k22 = principal_block(A, pairs, g2, g2)
-    k23 = principal_block(A, pairs, g2, g3)
-    k33 = principal_block(A, pairs, g3, g3)
-    if rate > wp.float64(0.0):
-        mu = rate * m.mu
-        lam = rate * m.lam
-        k11 += viscous_block(S, g1, g1, mu, lam)
-        k12 += viscous_block(S, g1, g2, mu, lam)
-        k13 += viscous_block(S, g1, g3, mu, lam)
-        k22 += viscous_block(S, g2, g2, mu, lam)
-        k23 += viscous_block(S, g2, g3, mu, lam)
-        k33 += viscous_block(S, g3, g3, mu, lam)
-    W = volume * U
-    Ut = wp.transpose(U)
-    k11 = W * k11 * Ut
-    k12 = W * k12 * Ut
-    k13 = W * k13 * Ut
-    k22 = W * k22 * Ut
-    k23 = W * k23 * Ut
-    k33 = W * k33 * Ut
-    k01 = -(k11 + wp.transpose(k12) + wp.transpose(k13))
-    k02 = -(k12 + k22 + wp.transpose(k23))
-    k03 = -(k13 + k23 + k33)
-    b = 10 * e
-    blocks_out[b] = -(k01 + k02 + k03)
-    blocks_out[b + 1] = k01
-    blocks_out[b + 2] = k02
-    blocks_out[b + 3] = k03
-    blocks_out[b + 4] = k11
-    blocks_out[b + 5] = k12
-    blocks_out[b + 6] = k13
-    blocks_out[b + 7] = k22
-    blocks_out[b + 8] = k23
-    blocks_out[b + 9] = k33
+    group = start + wp.tid()
+    # A CPU launch goes through its groups one after the other: they can share the first one's work.
+    place = wp.where(lanes == 1, group, start)
+    decompose_group(group, place, count, elements.tets, elements.inverse_rest, x, work_out)
+    for e in range(group * lanes, wp.min(count, (group + 1) * lanes)):
+        at = place * WORK * lanes + e - group * lanes
+        write_law(e, at, lanes, elements, cauchy_green, inverse_dt, work_out, gradient_out)
+    write_blocks_group(group, place, count, elements.volume, work_out, blocks_out)
 
 
 @wp.kernel

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from gdpro_sim.kernels.lanes import CPU_FLAGS
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 
 # Slots of the scalar array that the conjugate gradient steps share.
 CG_ALPHA = wp.constant(0)
@@ -24,20 +26,44 @@ CG_DONE = wp.constant(4)
 CG_ITERATIONS = wp.constant(5)
 
 
-@wp.func_native("""
-    // Plain loads over the rows' 9 consecutive doubles: twice as fast on the CPU as Warp's matrix type.
-    const int* columns_ = columns.data;
-    const double* values_ = reinterpret_cast<const double*>(values.data);
-    const double* x_ = reinterpret_cast<const double*>(x.data);
+_VECTORS = """
+    typedef double D __attribute__((ext_vector_type(4)));
+    auto load = [](const double* p) { D v; __builtin_memcpy(&v, p, sizeof(D)); return v; };
+    auto store = [](double* p, D v) { __builtin_memcpy(p, &v, sizeof(D)); };
+    // Rows 0 and 1 of a 3x3 matrix m are load(m) and load(m + 3), with a number of the next row behind them.
+    auto last_row = [&](const double* m) { return __builtin_shufflevector(load(m + 5), (D)0.0, 1, 2, 3, 4); };
+    auto dot = [](D v, D w) { const D m = v * w; return (m[0] + m[1]) + m[2]; };
+"""
+"""CPU text: vectors of 4 numbers, for 3 and a spare one."""
+
+
+@wp.func_native(f"""
+    const int* const columns_ = columns.data;
+    const double* const values_ = (const double*)values.data;
+    const double* const x_ = (const double*)x.data;
+#if defined(__CUDACC__)
     double s0 = 0.0, s1 = 0.0, s2 = 0.0;
-    for (int k = begin; k < end; ++k) {
-        const double* m = values_ + 9 * static_cast<size_t>(k);
-        const double* v = x_ + 3 * static_cast<size_t>(columns_[k]);
+    for (int k = begin; k < end; ++k) {{
+        const double* m = values_ + 9 * (size_t)k;
+        const double* v = x_ + 3 * (size_t)columns_[k];
         s0 += m[0] * v[0] + m[1] * v[1] + m[2] * v[2];
         s1 += m[3] * v[0] + m[4] * v[1] + m[5] * v[2];
         s2 += m[6] * v[0] + m[7] * v[1] + m[8] * v[2];
-    }
+    }}
     return wp::vec3d(s0, s1, s2);
+#else
+    {_VECTORS}
+    D s0 = (D)0.0, s1 = s0, s2 = s0;
+    for (int k = begin; k < end; ++k) {{
+        const double* const m = values_ + 9 * (size_t)k;
+        const double* const v = x_ + 3 * (size_t)columns_[k];
+        const D w = {{v[0], v[1], v[2], 0.0}};
+        s0 += load(m) * w;
+        s1 += load(m + 3) * w;
+        s2 += last_row(m) * w;
+    }}
+    return wp::vec3d((s0[0] + s0[1]) + s0[2], (s1[0] + s1[1]) + s1[2], (s2[0] + s2[1]) + s2[2]);
+#endif
 """)
 def row_product(
     begin: int,
@@ -144,6 +170,141 @@ def cg_update_row(
     return wp.dot(r, z)
 
 
+_CG_SERIAL = f"""
+#if !defined(__CUDACC__)
+    {_VECTORS}
+    const double* const entries = (const double*)values.data;
+    const double* const extra = (const double*)extra_values.data;
+    const double* const inverse = (const double*)inverse_diagonal.data;
+    const double* const b = (const double*)right_hand_side.data;
+    double* const x = (double*)x_out.data;
+    double* const residual = (double*)r_out.data;
+    double* const r = work.data;
+    double* const z = r + 4 * (size_t)rows;
+    double* const p = z + 4 * (size_t)rows;
+    double* const q = p + 4 * (size_t)rows;
+    double* const y = q + 4 * (size_t)rows;
+    double* const scalars = scalars_out.data;
+
+    auto precondition = [&](int i) {{
+        // The rows of a symmetric matrix are its columns.
+        const double* const m = inverse + 9 * (size_t)i;
+        const D v = load(r + 4 * (size_t)i);
+        D found = load(m) * (D)v[0];
+        found += load(m + 3) * (D)v[1];
+        found += last_row(m) * (D)v[2];
+        found[3] = 0.0;
+        store(z + 4 * (size_t)i, found);
+        return dot(v, found);
+    }};
+
+    double rz = 0.0;
+    for (int i = 0; i < rows; ++i) {{
+        const size_t at = 4 * (size_t)i;
+        const D v = {{b[3 * (size_t)i], b[3 * (size_t)i + 1], b[3 * (size_t)i + 2], 0.0}};
+        store(r + at, v);
+        store(y + at, (D)0.0);
+        store(p + at, (D)0.0);
+        rz += precondition(i);
+    }}
+    scalars[{CG_RZ_START}] = rz;
+    const double target = rz * tolerance * tolerance;
+    double beta = 0.0;
+    int iteration = 0;
+    bool done = rz <= 0.0;
+    while (!done && iteration < max_iterations) {{
+        for (int i = 0; i < rows; ++i) {{
+            const size_t at = 4 * (size_t)i;
+            store(p + at, load(z + at) + beta * load(p + at));
+            store(q + at, (D)0.0);
+        }}
+        double pq = 0.0;
+        for (int i = 0; i < rows; ++i) {{
+            const size_t at = 4 * (size_t)i;
+            const D v = load(p + at);
+            const D v0 = (D)v[0], v1 = (D)v[1], v2 = (D)v[2];
+            int k = diagonal.data[i];
+            const double* m = entries + 9 * (size_t)k;
+            D s0 = load(m) * v, s1 = load(m + 3) * v, s2 = last_row(m) * v;
+            const int end = offsets.data[i + 1];
+            for (++k; k < end; ++k) {{
+                m += 9;
+                const D m0 = load(m), m1 = load(m + 3), m2 = last_row(m);
+                const size_t other = 4 * (size_t)columns.data[k];
+                const D w = load(p + other);
+                s0 += m0 * w;
+                s1 += m1 * w;
+                s2 += m2 * w;
+                D t = load(q + other);
+                t += m0 * v0;
+                t += m1 * v1;
+                t += m2 * v2;
+                store(q + other, t);
+            }}
+            const int extra_end = extra_offsets.data[i + 1];
+            for (k = extra_offsets.data[i]; k < extra_end; ++k) {{
+                const double* const n = extra + 9 * (size_t)k;
+                const D w = load(p + 4 * (size_t)extra_columns.data[k]);
+                s0 += load(n) * w;
+                s1 += load(n + 3) * w;
+                s2 += last_row(n) * w;
+            }}
+            // What lies left of the diagonal came with the rows before.
+            D t = load(q + at);
+            t[0] += (s0[0] + s0[1]) + s0[2];
+            t[1] += (s1[0] + s1[1]) + s1[2];
+            t[2] += (s2[0] + s2[1]) + s2[2];
+            t[3] = 0.0;
+            store(q + at, t);
+            pq += dot(v, t);
+        }}
+        if (!(pq > 0.0)) break;
+        const double alpha = rz / pq;
+        const double previous = rz;
+        rz = 0.0;
+        for (int i = 0; i < rows; ++i) {{
+            const size_t at = 4 * (size_t)i;
+            store(y + at, load(y + at) + alpha * load(p + at));
+            store(r + at, load(r + at) - alpha * load(q + at));
+            rz += precondition(i);
+        }}
+        beta = rz / previous;
+        ++iteration;
+        done = rz <= target;
+    }}
+    for (int i = 0; i < rows; ++i)
+        for (int j = 0; j < 3; ++j) {{
+            x[3 * (size_t)i + j] = y[4 * (size_t)i + j];
+            residual[3 * (size_t)i + j] = r[4 * (size_t)i + j];
+        }}
+    scalars[{CG_RZ}] = rz;
+    scalars[{CG_ITERATIONS}] = iteration;
+    scalars[{CG_DONE}] = done ? 1.0 : 0.0;
+#endif
+"""
+
+
+@wp.func_native(_CG_SERIAL)
+def cg_solve(
+    rows: int,
+    max_iterations: int,
+    tolerance: wp.float64,
+    offsets: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    diagonal: wp.array[wp.int32],
+    values: wp.array[wp.mat33d],
+    extra_offsets: wp.array[wp.int32],
+    extra_columns: wp.array[wp.int32],
+    extra_values: wp.array[wp.mat33d],
+    inverse_diagonal: wp.array[wp.mat33d],
+    right_hand_side: wp.array[wp.vec3d],
+    work: wp.array[wp.float64],
+    r_out: wp.array[wp.vec3d],
+    x_out: wp.array[wp.vec3d],
+    scalars_out: wp.array[wp.float64],
+): ...
+
+
 @wp.kernel
 def cg_serial(
     # In:
@@ -152,6 +313,7 @@ def cg_serial(
     tolerance: wp.float64,
     offsets: wp.array[wp.int32],
     columns: wp.array[wp.int32],
+    diagonal: wp.array[wp.int32],
     values: wp.array[wp.mat33d],
     extra_offsets: wp.array[wp.int32],
     extra_columns: wp.array[wp.int32],
@@ -159,48 +321,35 @@ def cg_serial(
     inverse_diagonal: wp.array[wp.mat33d],
     right_hand_side: wp.array[wp.vec3d],
     # Work:
-    r_out: wp.array[wp.vec3d],
-    z_out: wp.array[wp.vec3d],
-    p_out: wp.array[wp.vec3d],
-    q_out: wp.array[wp.vec3d],
+    work: wp.array[wp.float64],
     # Out:
+    r_out: wp.array[wp.vec3d],
     x_out: wp.array[wp.vec3d],
     scalars_out: wp.array[wp.float64],
 ):
-    """Preconditioned conjugate gradients (Saad, Iterative Methods, 2nd ed., algorithm 9.1), one thread.
+    """Preconditioned conjugate gradients (Saad, Iterative Methods, 2nd ed., algorithm 9.1), one CPU thread.
 
-    Stops when r.M^-1 r has fallen by tolerance^2. Launch with dim 1.
+    Stops when r.M^-1 r has fallen by tolerance^2. Launch with dim 1. `values` is symmetric as a whole, each
+    row's columns ascending; `diagonal` [rows] holds the places of its diagonal; `work` holds 20 rows.
     """
-    rz = wp.float64(0.0)
-    for i in range(rows):
-        rz += cg_reset_row(i, right_hand_side, inverse_diagonal, x_out, r_out, z_out, p_out)
-    scalars_out[CG_RZ_START] = rz
-    target = rz * tolerance * tolerance
-    beta = wp.float64(0.0)
-    iteration = int(0)  # a bare literal would be a constant to Warp
-    done = rz <= wp.float64(0.0)
-    while not done and iteration < max_iterations:
-        for i in range(rows):
-            p_out[i] = z_out[i] + beta * p_out[i]
-        pq = wp.float64(0.0)
-        for i in range(rows):
-            q = row_product(offsets[i], offsets[i + 1], columns, values, p_out)
-            q += row_product(extra_offsets[i], extra_offsets[i + 1], extra_columns, extra_values, p_out)
-            q_out[i] = q
-            pq += wp.dot(p_out[i], q)
-        if pq <= wp.float64(0.0):
-            break
-        alpha = rz / pq
-        previous = rz
-        rz = wp.float64(0.0)
-        for i in range(rows):
-            rz += cg_update_row(i, alpha, p_out, q_out, inverse_diagonal, x_out, r_out, z_out)
-        beta = rz / previous
-        iteration += 1
-        done = rz <= target
-    scalars_out[CG_RZ] = rz
-    scalars_out[CG_ITERATIONS] = wp.float64(iteration)
-    scalars_out[CG_DONE] = wp.where(done, wp.float64(1.0), wp.float64(0.0))
+    cg_solve(
+        rows,
+        max_iterations,
+        tolerance,
+        offsets,
+        columns,
+        diagonal,
+        values,
+        extra_offsets,
+        extra_columns,
+        extra_values,
+        inverse_diagonal,
+        right_hand_side,
+        work,
+        r_out,
+        x_out,
+        scalars_out,
+    )
 
 
 @wp.kernel

@@ -98,11 +98,8 @@ class Batch:
         """Gradient [T, 4, 3] and Hessian [T, 12, 12]."""
         p = self.potential
         array = wp.array(x.reshape(-1, 3), dtype=wp.vec3d, device="cpu")
-        p.over_elements(
-            elements.element_derivatives,
-            [p.elements, array, p._cauchy_green, inverse_dt],
-            [p.element_gradient, p._element_blocks],
-        )
+        p._inverse_h = inverse_dt
+        p.differentiate_elements(array)
         blocks = p._element_blocks.numpy().reshape(-1, 10, 3, 3)
         full = np.zeros((len(x), 4, 3, 4, 3))
         for slot, (a, b) in enumerate(itertools.combinations_with_replacement(range(4), 2)):

@@ -43,6 +43,8 @@ class ConjugateGradient:
         self.blocks = min(ROW_BLOCKS, self.rows) if device == "cpu" else self.rows
         self.offsets: wp.array = wp.array(topology.offsets, dtype=wp.int32, device=device)
         self.columns: wp.array = wp.array(topology.columns, dtype=wp.int32, device=device)
+        self._diagonal: wp.array = wp.array(topology.diagonal, dtype=wp.int32, device=device)
+        self._work = wp.zeros(20 * self.rows, dtype=wp.float64, device=device)
         self.values = wp.zeros(len(topology.columns), dtype=wp.mat33d, device=device)
         self._extra_offsets = wp.zeros(self.rows + 1, dtype=wp.int32, device=device)
         self._extra_columns = wp.zeros(0, dtype=wp.int32, device=device)
@@ -105,6 +107,7 @@ class ConjugateGradient:
                 tolerance,
                 self.offsets,
                 self.columns,
+                self._diagonal,
                 self.values,
                 self._extra_offsets,
                 self._extra_columns,
@@ -112,7 +115,7 @@ class ConjugateGradient:
                 self.inverse_diagonal,
                 self.right_hand_side,
             ],
-            outputs=[self.residual, self._z, self._p, self._q, self.solution, self._scalars],
+            outputs=[self._work, self.residual, self.solution, self._scalars],
             device=self.device,
         )
 

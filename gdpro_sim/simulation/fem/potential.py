@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from gdpro_sim.device import launch_chunked
-from gdpro_sim.kernels import elements, fem, linalg
+from gdpro_sim.kernels import element_lanes, elements, fem, linalg
 from gdpro_sim.simulation.fem.conjugate_gradient import ConjugateGradient
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
 from gdpro_sim.simulation.fem.term import Step, Term
@@ -56,6 +56,7 @@ class IncrementalPotential:
         self.elements.yield_stress = reals(rest.yield_stress, device)
         self.elements.hardening = reals(rest.hardening, device)
         self.elements.plastic_strain = wp.zeros(t, dtype=wp.float64, device=device)
+        self.elements.pressure = wp.zeros(t, dtype=wp.float64, device=device)
         self.elements.mu = reals(rest.mu, device)
         self.elements.lam = reals(rest.lam, device)
         self.elements.damping = reals(model.rayleigh_stiffness, device)
@@ -74,6 +75,11 @@ class IncrementalPotential:
         self._cauchy_green = wp.zeros(t, dtype=wp.mat33d, device=device)
         self.element_gradient = wp.zeros(4 * t, dtype=wp.vec3d, device=device)
         self._element_blocks = wp.zeros(BLOCKS_PER_ELEMENT * t, dtype=wp.mat33d, device=device)
+        self._lanes = element_lanes.LANES if device == "cpu" else 1
+        self._groups = -(-t // self._lanes)
+        self._work = wp.zeros(
+            self._groups * self._lanes * int(element_lanes.WORK), dtype=wp.float64, device=device
+        )
         self._energies = wp.zeros(
             t + p + sum(term.energies for term in terms), dtype=wp.float64, device=device
         )
@@ -145,11 +151,7 @@ class IncrementalPotential:
     def linearise(self, x: wp.array) -> None:
         """Fill the linear system H d = -gradient at x."""
         system = self.system
-        self.over_elements(
-            elements.element_derivatives,
-            [self.elements, x, self._cauchy_green, self._inverse_h],
-            [self.element_gradient, self._element_blocks],
-        )
+        self.differentiate_elements(x)
         launch_chunked(
             linalg.gather_off_diagonal,
             self._pair_count,
@@ -173,6 +175,17 @@ class IncrementalPotential:
                 self._diagonal,
             ],
             [system.right_hand_side, system.values, system.inverse_diagonal],
+        )
+
+    def differentiate_elements(self, x: wp.array) -> None:
+        """Gradients and projected Hessian blocks of the elements at x."""
+        launch_chunked(
+            elements.element_derivatives,
+            self._groups,
+            [self._lanes, self.element_count, self.elements, x, self._cauchy_green, self._inverse_h],
+            [self._work, self.element_gradient, self._element_blocks],
+            device=self.device,
+            minimum=64,
         )
 
     def forces(self, x: wp.array) -> None:
