@@ -219,8 +219,88 @@ def launch_chunked(
     run_chunks(launch, count, minimum)
 
 
+class Launches:
+    """`launch_chunked` for kernels launched again and again over the same arrays: arguments are packed once.
+
+    Packing costs more than running a small kernel. Belongs to the owner of the arrays, which it keeps alive.
+    Numbers may differ from call to call. A struct is packed at its first launch: its arrays may change, but
+    not be exchanged for others.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self._recorded: dict[tuple[Any, ...], _Recorded] = {}
+
+    def __call__(
+        self,
+        kernel: wp.Kernel,
+        count: int,
+        inputs: Sequence[Any],
+        outputs: Sequence[Any] = (),
+        *,
+        minimum: int = 1024,
+    ) -> None:
+        """Launch `kernel(start, *inputs, *outputs)` over `count` indices: once on CUDA, per core on the CPU."""
+        if count <= 0:
+            return
+        arguments = [*inputs, *outputs]
+        identity = (count, *(id(a) if _is_held(a) else None for a in arguments))
+        recorded = self._recorded.get((kernel, *identity))
+        if recorded is None:
+            if len(self._recorded) >= MAX_RECORDED:
+                self._recorded.clear()
+            wp.load_module(kernel.module, device=self.device)
+            recorded = self._recorded[(kernel, *identity)] = _Recorded(kernel, arguments, self.device)
+        numbers = [a for a in arguments if not _is_held(a)]
+        if self.device != "cpu":
+            recorded.launch(0, count, numbers)
+        else:
+            run_chunks(lambda begin, end: recorded.launch(begin, end, numbers), count, minimum)
+
+
+MAX_RECORDED = 512
+"""Launches remembered by one `Launches` before it forgets them all: more means arrays that come and go."""
+
+
+def _is_held(argument: Any) -> bool:
+    return hasattr(argument, "__ctype__")  # arrays and structs
+
+
+class _Recorded:
+    """One kernel over one set of arrays: a command for each range of indices seen."""
+
+    def __init__(self, kernel: wp.Kernel, arguments: list[Any], device: str) -> None:
+        self._kernel, self._arguments, self._device = kernel, arguments, device
+        self._places = [k for k, argument in enumerate(arguments) if not _is_held(argument)]
+        self._commands: dict[tuple[int, int], tuple[wp.Launch, list[Any]]] = {}
+
+    def launch(self, begin: int, end: int, numbers: list[Any]) -> None:
+        """`numbers` are the arguments that are no arrays or structs, in order."""
+        found = self._commands.get((begin, end))
+        if found is None:
+            arguments = list(self._arguments)
+            for place, number in zip(self._places, numbers, strict=True):
+                arguments[place] = number
+            command = wp.launch(
+                self._kernel,
+                dim=end - begin,
+                inputs=[begin, *arguments],
+                device=self._device,
+                record_cmd=True,
+            )
+            self._commands[begin, end] = (command, list(numbers))
+        else:
+            command, known = found
+            for k, number in enumerate(numbers):
+                if known[k] is not number and known[k] != number:
+                    command.set_param_at_index(self._places[k] + 1, number)
+                    known[k] = number
+        command.launch()
+
+
 __all__ = [
     "PIECES",
+    "Launches",
     "beside_torch",
     "device_name",
     "launch_chunked",

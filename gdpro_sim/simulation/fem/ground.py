@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from gdpro_sim.device import launch_chunked
+from gdpro_sim.device import Launches
 from gdpro_sim.kernels import ground as kernels
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
 from gdpro_sim.simulation.fem.term import Step
@@ -36,6 +36,7 @@ class GroundContact:
     def __init__(self, model: Model, rest: RestShapes) -> None:
         assert model.ground is not None
         self.device = model.device
+        self._launch = Launches(model.device)
         self.energies = len(model.vertices)
         stiffness, stick, ramp = _scales(model, rest)
         carried = rest.mass > 0.0
@@ -94,7 +95,7 @@ class GroundContact:
         }
 
     def _over_vertices(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        launch_chunked(kernel, self.energies, inputs, outputs, device=self.device, minimum=4096)
+        self._launch(kernel, self.energies, inputs, outputs, minimum=4096)
 
 
 def _scales(model: Model, rest: RestShapes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

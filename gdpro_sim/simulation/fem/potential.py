@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from gdpro_sim.device import launch_chunked
+from gdpro_sim.device import Launches
 from gdpro_sim.kernels import element_lanes, elements, fem, linalg
 from gdpro_sim.simulation.fem.conjugate_gradient import ConjugateGradient
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
@@ -17,6 +17,8 @@ from gdpro_sim.simulation.model import Model
 
 RANGES = 128
 """Partial sums of energies and measures: fixed, so that totals do not depend on the number of threads."""
+
+NOTHING = wp.vec3d()
 
 
 class StepMeasures(NamedTuple):
@@ -38,6 +40,7 @@ class IncrementalPotential:
         self.vertex_count = len(model.vertices)
         self.element_count = len(model.tets)
         device, p, t = self.device, self.vertex_count, self.element_count
+        self._launch = Launches(device)
         self.terms = terms
         self.mass = rest.mass
         self._pinned, self._massless = model.pinned, rest.mass <= 0.0
@@ -152,12 +155,11 @@ class IncrementalPotential:
         """Fill the linear system H d = -gradient at x."""
         system = self.system
         self.differentiate_elements(x)
-        launch_chunked(
+        self._launch(
             linalg.gather_off_diagonal,
             self._pair_count,
             [*self._pairs, self._element_blocks, *self._mirrored],
             [system.values],
-            device=self.device,
         )
         system.couple(self._add_terms(x))
         self.over_vertices(
@@ -179,12 +181,11 @@ class IncrementalPotential:
 
     def differentiate_elements(self, x: wp.array) -> None:
         """Gradients and projected Hessian blocks of the elements at x."""
-        launch_chunked(
+        self._launch(
             elements.element_derivatives,
             self._groups,
             [self._lanes, self.element_count, self.elements, x, self._cauchy_green, self._inverse_h],
             [self._work, self.element_gradient, self._element_blocks],
-            device=self.device,
             minimum=64,
         )
 
@@ -206,23 +207,21 @@ class IncrementalPotential:
 
     def largest_acceleration(self) -> float:
         """Largest |gradient_i| / m_i, m/s^2, of the last `linearise`."""
-        launch_chunked(
+        self._launch(
             fem.residual_measure,
             RANGES,
             [self.vertex_count, RANGES, self.system.right_hand_side, self.vertices.mass],
             [self._maxima],
-            device=self.device,
         )
         return float(np.sqrt(self._maxima.numpy().max()))
 
     def step_measures(self) -> StepMeasures:
         """Slope of E along the system's solution, J, and the largest vertex move in it, m."""
-        launch_chunked(
+        self._launch(
             fem.step_measures,
             RANGES,
             [self.vertex_count, RANGES, self.system.solution, self.system.right_hand_side],
             [self._sums, self._maxima],
-            device=self.device,
         )
         return StepMeasures(float(self._sums.numpy().sum()), float(np.sqrt(self._maxima.numpy().max())))
 
@@ -234,7 +233,7 @@ class IncrementalPotential:
         self, a: wp.array, weight_a: float, b: wp.array, weight_b: float, out: wp.array, constant: Any = None
     ) -> None:
         """out = weight_a a + weight_b b + constant, [P] vec3d; `out` may be `a` or `b`."""
-        inputs = [a, weight_a, b, weight_b, wp.vec3d() if constant is None else constant]
+        inputs = [a, weight_a, b, weight_b, NOTHING if constant is None else constant]
         self.over_vertices(fem.combine, inputs, [out])
 
     def hold(self, held: wp.array, out: wp.array) -> None:
@@ -277,16 +276,14 @@ class IncrementalPotential:
         return float(self._energies.numpy()[: self.element_count].min())
 
     def _total(self, terms: wp.array) -> float:
-        launch_chunked(
-            linalg.sum_ranges, RANGES, [len(terms), RANGES, terms], [self._sums], device=self.device
-        )
+        self._launch(linalg.sum_ranges, RANGES, [len(terms), RANGES, terms], [self._sums])
         return float(self._sums.numpy().sum())
 
     def over_vertices(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        launch_chunked(kernel, self.vertex_count, inputs, outputs, device=self.device, minimum=4096)
+        self._launch(kernel, self.vertex_count, inputs, outputs, minimum=4096)
 
     def over_elements(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        launch_chunked(kernel, self.element_count, inputs, outputs, device=self.device, minimum=256)
+        self._launch(kernel, self.element_count, inputs, outputs, minimum=256)
 
 
 __all__ = ["IncrementalPotential", "StepMeasures"]
