@@ -285,8 +285,10 @@ def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray
 
 def _path(scene: Scene, body: SceneBody, low: np.ndarray, size: float, friction: float) -> list[np.ndarray]:
     """Where a body is likely to go, as shifts of its box: a throw, then a slide that friction ends."""
-    if body.pins is not None:
-        return [np.zeros(3), np.array([0.0, 0.0, -0.3 * size])]
+    if body.pins:
+        keys = [key.translation for pin in body.pins for key in pin.motion]
+        sag = np.array([0.0, 0.0, -0.3 * size])
+        return [np.zeros(3), sag, *(np.asarray(way) for way in keys), *(way + sag for way in keys)]
     shifts: list[np.ndarray] = []
     velocity, gravity = np.asarray(body.velocity), np.asarray(scene.gravity)
     for t in np.linspace(0.0, scene.duration, 60):

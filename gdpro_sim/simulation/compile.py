@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,12 +13,10 @@ from scipy.spatial.transform import Rotation
 from gdpro_sim.asset import Asset, import_mesh, kind, tetrahedralize_asset
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
-from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.tetmesh import TetMesh
+from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
 from gdpro_sim.simulation.model import Body, FemSettings, Ground, Model
 from gdpro_sim.simulation.scene import Scene, SceneBody
-
-logger = logging.getLogger(__name__)
 
 FALLBACK_MATERIAL = "jelly"
 
@@ -90,14 +88,16 @@ def load_assets(
 def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu") -> Model:
     """Place every body and gather the arrays of a `Model` for `device`.
 
-    Raises SceneError where a body starts below the ground or a pin box holds no vertex.
+    Raises SceneError where a body starts below the ground, has bad elements, or pins and loads select nothing
+    or contradict themselves.
     """
     bodies: list[Body] = []
     columns: dict[str, list[np.ndarray]] = {
         key: []
         for key in (
             "vertices", "velocities", "tets", "fill", "young", "poisson", "density",
-            "rayleigh_mass", "rayleigh_stiffness", "friction", "contact_offset", "pinned",
+            "rayleigh_mass", "rayleigh_stiffness", "law", "yield_stress", "hardening", "friction",
+            "contact_offset",
         )
     }  # fmt: skip
     vertex_begin = tet_begin = 0
@@ -105,6 +105,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         asset = assets[body.name]
         if asset.tets is None or asset.embedding is None:
             raise SceneError(f"{scene.name}: body {body.name!r}: its asset has no tetrahedra")
+        _check_tets(f"{scene.name}: body {body.name!r}", asset.tets)
         material = _material(body, asset)
         rest = asset.gaussians.vertices.cpu().numpy()
         factor = body.scale
@@ -127,13 +128,17 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         columns["velocities"].append((spin + np.asarray(body.velocity)).astype(np.float32))
         columns["tets"].append(asset.tets.tets + np.int32(vertex_begin))
         columns["fill"].append(asset.tets.fill)
-        for key in ("young", "poisson", "density", "rayleigh_mass", "rayleigh_stiffness"):
+        for key in ("young", "poisson", "density", "rayleigh_mass", "rayleigh_stiffness", "hardening"):
             columns[key].append(np.full(elements, getattr(material, key), np.float32))
+        yields = np.inf if material.yield_stress is None else material.yield_stress
+        columns["yield_stress"].append(np.full(elements, yields, np.float32))
+        columns["law"].append(np.full(elements, material.law, np.int32))
         columns["friction"].append(np.full(count, material.friction, np.float32))
         columns["contact_offset"].append(
-            _outside(asset.tets.vertices, rest, asset.gaussians.faces.cpu().numpy())
+            distance_outside(asset.tets.vertices, rest, asset.gaussians.faces.cpu().numpy()).astype(
+                np.float32
+            )
         )
-        columns["pinned"].append(_pinned(scene, body, vertices))
         bodies.append(
             Body(
                 name=body.name,
@@ -146,32 +151,43 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         )
         vertex_begin += count
         tet_begin += elements
-    if len(bodies) > 1:
-        logger.warning("bodies collide with the ground but not yet with each other or themselves")
     options = scene.solver
-    return Model(
+    arrays: dict[str, Any] = {key: np.concatenate(parts) for key, parts in columns.items()}
+    model = Model(
         bodies=tuple(bodies),
-        **{key: np.concatenate(parts) for key, parts in columns.items()},
+        **arrays,
+        pinned=np.zeros(vertex_begin, bool),
         gravity=scene.gravity,
         ground=None if scene.ground is None else Ground(scene.ground.height),
         fem=FemSettings(**{k: v for k, v in options.model_dump().items() if k != "kind"}),
         device=device,
     )
+    return apply_conditions(scene, model)
+
+
+def _check_tets(where: str, mesh: TetMesh) -> None:
+    if not len(mesh.tets):
+        raise SceneError(f"{where}: its asset has no tetrahedra")
+    volumes = mesh.volumes()
+    bad = np.flatnonzero(~(volumes > 0.0))
+    if len(bad):
+        raise SceneError(
+            f"{where}: tetrahedron {bad[0]} has volume {volumes[bad[0]]:.3g} m^3 ({len(bad)} such), must be "
+            "positive: repair the mesh, or give another number of `tets`"
+        )
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.tets] = True
+    if not used.all():
+        lone = np.flatnonzero(~used)
+        raise SceneError(
+            f"{where}: tet vertex {lone[0]} belongs to no tetrahedron ({len(lone)} such); remove them"
+        )
 
 
 def _centre_of_mass(tets: TetMesh, vertices: np.ndarray) -> np.ndarray:
     """Centre of mass [3] of placed tet `vertices` [P, 3] of one density."""
     mass = tets.volumes() * tets.fill
     return (mass[:, None] * vertices[tets.tets].mean(axis=1)).sum(axis=0) / mass.sum()
-
-
-def _outside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """How far each of `points` [P, 3] lies outside a surface, float32 [P] m; zero inside."""
-    index = SurfaceIndex(vertices, faces, winding=True)
-    face, weights = index.closest(points)
-    nearest = np.einsum("pc,pci->pi", weights.astype(np.float64), vertices[faces[face]])
-    distance = np.linalg.norm(points - nearest, axis=1)
-    return np.where(index.inside(points), 0.0, distance).astype(np.float32)
 
 
 def _material(body: SceneBody, asset: Asset) -> Material:
@@ -196,23 +212,6 @@ def _check_above_ground(scene: Scene, body: SceneBody, surface: np.ndarray) -> N
             f"{scene.name}: body {body.name!r} starts {below:.3g} m below the ground at z = "
             f"{scene.ground.height:g} m; raise its position by at least that much"
         )
-
-
-def _pinned(scene: Scene, body: SceneBody, vertices: np.ndarray) -> np.ndarray:
-    if body.pins is None:
-        return np.zeros(len(vertices), bool)
-    inside = np.ones(len(vertices), bool)
-    if body.pins.minimum is not None:
-        inside &= np.all(vertices >= body.pins.minimum, axis=1)
-    if body.pins.maximum is not None:
-        inside &= np.all(vertices <= body.pins.maximum, axis=1)
-    if not inside.any():
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        raise SceneError(
-            f"{scene.name}: body {body.name!r}: the pin box holds no vertex; the body spans "
-            f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} m"
-        )
-    return inside
 
 
 __all__ = ["check_files", "compile_scene", "load_assets"]

@@ -9,6 +9,9 @@ from pydantic import Field, field_validator, model_validator
 
 from gdpro_sim.simulation.options import Options, Vector
 
+SLACK = 1e-6
+"""How much of the body's extent vertices may lie outside a region: coordinates are rounded."""
+
 SIDES: dict[str, tuple[int, bool]] = {
     "left": (0, False),
     "right": (0, True),
@@ -84,15 +87,15 @@ class Region(Options):
 
         Raises IndexError with the id where an explicit vertex is none of them.
         """
+        slack = SLACK * float(np.ptp(points, axis=0).max())
         if self.side is not None:
             axis, upper = SIDES[self.side]
             along = points[:, axis]
             low, high = float(along.min()), float(along.max())
             depth = (0.05 if self.fraction is None else self.fraction) * (high - low)
-            slack = 1e-9 * (high - low)
             return along >= high - depth - slack if upper else along <= low + depth + slack
         if self.center is not None and self.radius is not None:
-            return np.linalg.norm(points - np.asarray(self.center), axis=1) <= self.radius
+            return np.linalg.norm(points - np.asarray(self.center), axis=1) <= self.radius + slack
         inside = np.zeros(len(points), bool)
         if self.vertices is not None:
             if max(self.vertices) >= len(points):
@@ -101,9 +104,9 @@ class Region(Options):
             return inside
         inside[:] = True
         if self.minimum is not None:
-            inside &= np.all(points >= self.minimum, axis=1)
+            inside &= np.all(points >= np.asarray(self.minimum) - slack, axis=1)
         if self.maximum is not None:
-            inside &= np.all(points <= self.maximum, axis=1)
+            inside &= np.all(points <= np.asarray(self.maximum) + slack, axis=1)
         return inside
 
 

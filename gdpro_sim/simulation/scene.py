@@ -8,21 +8,25 @@ import importlib.util
 import logging
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
-from gdpro_sim.simulation.model import Integrator
-
-Vector = tuple[
-    Annotated[float, Field(allow_inf_nan=False)],
-    Annotated[float, Field(allow_inf_nan=False)],
-    Annotated[float, Field(allow_inf_nan=False)],
-]
-
+from gdpro_sim.simulation.forces import (
+    AirFlow,
+    Attachment,
+    ConstantForce,
+    Pin,
+    Push,
+    Spring,
+    SurfacePressure,
+    several,
+)
+from gdpro_sim.simulation.model import FemSettings, Integrator
+from gdpro_sim.simulation.options import Options, Vector
 
 log = logging.getLogger(__name__)
 
@@ -30,18 +34,7 @@ STIFFEST = 1.0e7
 """Young's modulus in Pa to which `drop_scene` limits materials."""
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Pins(_Strict):
-    """Vertices of the body's tets held in place: those inside a world-space box at the start."""
-
-    minimum: Vector | None = Field(default=None, description="lower corner, m; default: no limit")
-    maximum: Vector | None = Field(default=None, description="upper corner, m; default: no limit")
-
-
-class SceneBody(_Strict):
+class SceneBody(Options):
     """One soft body."""
 
     name: str = Field(
@@ -81,7 +74,15 @@ class SceneBody(_Strict):
     material: Material | None = Field(
         default=None, description="preset name or values; default: the asset's, else jelly"
     )
-    pins: Pins | None = Field(default=None, description="box of vertices that never move")
+    pins: tuple[Pin, ...] = Field(default=(), description="parts held in place, or moved along keyframes")
+    forces: tuple[ConstantForce, ...] = Field(default=(), description="constant forces on parts of it")
+    impulses: tuple[Push, ...] = Field(default=(), description="pushes at a time")
+    pressures: tuple[SurfacePressure, ...] = Field(default=(), description="on parts of its surface")
+
+    @field_validator("pins", "forces", "impulses", "pressures", mode="before")
+    @classmethod
+    def _several(cls, value: Any) -> Any:
+        return () if value is None else several(value)
 
     @model_validator(mode="before")
     @classmethod
@@ -102,13 +103,13 @@ class SceneBody(_Strict):
         return self
 
 
-class GroundPlane(_Strict):
+class GroundPlane(Options):
     """The floor z = height."""
 
     height: float = Field(default=0.0, description="m")
 
 
-class Camera(_Strict):
+class Camera(Options):
     """The preview's camera. Anything left out is chosen so that the bodies and their fall fit the picture."""
 
     eye: Vector | None = Field(default=None, description="m")
@@ -133,7 +134,7 @@ class Camera(_Strict):
         return value
 
 
-class Render(_Strict):
+class Render(Options):
     """How the preview looks."""
 
     shading: Literal["studio", "none"] = Field(
@@ -142,7 +143,7 @@ class Render(_Strict):
     background: Literal["studio", "white", "black"] = "studio"
 
 
-class SolverOptions(_Strict):
+class SolverOptions(Options):
     """Settings of the FEM solver; the defaults are converged for the shipped scenes."""
 
     kind: Literal["fem"] = "fem"
@@ -160,9 +161,21 @@ class SolverOptions(_Strict):
     contact_stiffness: float = Field(
         default=1.0, gt=0.0, description="multiple of the automatic ground stiffness"
     )
+    contact_gap: float = Field(
+        default=FemSettings.contact_gap,
+        gt=0.0,
+        lt=0.1,
+        description="distance kept between bodies, as a fraction of the smallest one's size",
+    )
+    body_contact: bool = Field(
+        default=FemSettings.body_contact, description="whether bodies collide with each other"
+    )
+    self_contact: bool = Field(
+        default=FemSettings.self_contact, description="whether bodies collide with themselves"
+    )
 
 
-class Scene(_Strict):
+class Scene(Options):
     """A whole simulation: bodies, world, time, camera and solver. SI units, Z up."""
 
     name: str = Field(default="scene", min_length=1)
@@ -176,6 +189,11 @@ class Scene(_Strict):
     camera: Camera = Field(default_factory=Camera)
     render: Render = Field(default_factory=Render)
     solver: SolverOptions = Field(default_factory=SolverOptions)
+    wind: tuple[AirFlow, ...] = Field(default=(), description="air that drags and lifts; one or several")
+    springs: tuple[Spring, ...] = Field(default=(), description="between bodies, or a body and the world")
+    attachments: tuple[Attachment, ...] = Field(
+        default=(), description="bodies tied together where they meet"
+    )
     folder: Path = Field(
         default_factory=Path.cwd, exclude=True, description="where relative paths start; set by load_scene"
     )
@@ -187,6 +205,39 @@ class Scene(_Strict):
             if body.name in seen:
                 raise ValueError(f"two bodies are named {body.name!r}; give each a `name` of its own")
             seen.add(body.name)
+        return self
+
+    @field_validator("wind", "springs", "attachments", mode="before")
+    @classmethod
+    def _several(cls, value: Any) -> Any:
+        return () if value is None else several(value)
+
+    @model_validator(mode="after")
+    def _names_known(self) -> Scene:
+        used = [
+            *((f"springs[{k}].ends[{e}].body", end.body)
+              for k, spring in enumerate(self.springs) for e, end in enumerate(spring.ends)),
+            *((f"attachments[{k}].bodies", name)
+              for k, ties in enumerate(self.attachments) for name in ties.bodies),
+            *((f"wind[{k}].bodies", name) for k, air in enumerate(self.wind) for name in air.bodies or ()),
+        ]  # fmt: skip
+        names = [body.name for body in self.bodies]
+        for place, name in used:
+            if name is not None and name not in names:
+                near = difflib.get_close_matches(name, names, n=1)
+                hint = f" (did you mean {near[0]!r}?)" if near else ""
+                raise ValueError(f"{place}: there is no body {name!r}{hint}; bodies: {', '.join(names)}")
+        return self
+
+    @model_validator(mode="after")
+    def _pushed_in_time(self) -> Scene:
+        if self.solver.integrator == "quasi-static":
+            for body in self.bodies:
+                if body.impulses:
+                    raise ValueError(
+                        f"bodies[{body.name}].impulses: have no effect without inertia (quasi-static); give "
+                        "`forces`"
+                    )
         return self
 
     @property
@@ -375,7 +426,6 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 __all__ = [
     "Camera",
     "GroundPlane",
-    "Pins",
     "Render",
     "Scene",
     "SceneBody",

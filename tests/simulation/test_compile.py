@@ -67,7 +67,7 @@ def test_placement(ball: Asset) -> None:
 def test_wrong_placements_are_refused(ball: Asset) -> None:
     with pytest.raises(SceneError, match=r"starts 0\.1 m below the ground"):
         compiled(ball, position=[0, 0, -0.1])
-    with pytest.raises(SceneError, match="the pin box holds no vertex; the body spans"):
+    with pytest.raises(SceneError, match=r"pins\[0\]: the box holds no vertex; the body spans"):
         compiled(ball, pins={"minimum": [5, 5, 5]})
     with pytest.raises(SceneError, match="no tetrahedra"):
         compiled(replace(ball, tets=None, embedding=None))

@@ -390,7 +390,7 @@ def test_pins_go_where_they_are_told(rule: str) -> None:
             np.testing.assert_allclose(
                 np.linalg.norm(found - found[i], axis=1), np.linalg.norm(start - start[i], axis=1), atol=1e-12
             )
-    end = Rotation.from_euler("y", 90.0, degrees=True).apply(start - [0, 0, 0.2]) + [0, 0, 0.2]
+    end = motion.pivot + Rotation.from_euler("y", 90.0, degrees=True).apply(start - motion.pivot)
     np.testing.assert_allclose(found, end, atol=1e-9)
 
 

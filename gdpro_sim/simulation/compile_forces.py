@@ -1,0 +1,275 @@
+"""Pins, springs, attachments and loads of a scene -> the boundary conditions and loads of its `Model`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gdpro_sim.errors import SceneError
+from gdpro_sim.meshing.embedding import boundary, embed_surface
+from gdpro_sim.meshing.proximity import SurfaceIndex
+from gdpro_sim.meshing.tetmesh import TetMesh
+from gdpro_sim.simulation.conditions import FOREVER, Force, Impulse, Load, Motion, Pressure, Springs, Wind
+from gdpro_sim.simulation.forces import Attachment, Pin, Spring, SpringEnd
+from gdpro_sim.simulation.model import Body, Model
+from gdpro_sim.simulation.regions import Region
+from gdpro_sim.simulation.scene import Scene, SceneBody
+
+END_OUTSIDE = 0.05
+"""A spring's end may lie this much outside its body, as a fraction of the body's size."""
+
+TIE_DISTANCE = 0.02
+"""Attachments reach this far where nothing else is said, as a fraction of the first body's size."""
+
+TIE_PER_ELASTIC = 10.0
+"""Stiffness of a tie as a multiple of that with which a vertex's own elements hold it."""
+
+
+def apply_conditions(scene: Scene, model: Model) -> Model:
+    """`model`, placed and without any, with the pins, springs and loads of its scene.
+
+    Raises SceneError for what selects nothing or contradicts itself.
+    """
+    placed = [_Placed(scene, body, model) for body in model.bodies]
+    by_name = {body.name: body for body in placed}
+    pinned = np.zeros(len(model.vertices), bool)
+    release = np.full(len(model.vertices), FOREVER)
+    motions: list[Motion] = []
+    loads: list[Load] = []
+    for body, item in zip(scene.bodies, placed, strict=True):
+        motions += _pins(body, item, pinned, release)
+        loads += _loads(body, item, model)
+    for air in scene.wind:
+        names = air.bodies or [body.name for body in scene.bodies]
+        faces = np.concatenate([by_name[name].faces + by_name[name].first for name in dict.fromkeys(names)])
+        end = FOREVER if air.end is None else air.end
+        loads.append(Wind(faces, air.velocity, air.density, air.drag, air.lift, air.start, end))
+    springs = [_spring(scene, k, spring, by_name) for k, spring in enumerate(scene.springs)]
+    springs += [_ties(scene, k, ties, by_name, model) for k, ties in enumerate(scene.attachments)]
+    return replace(
+        model,
+        pinned=pinned,
+        release=release if np.isfinite(release).any() else None,
+        motions=tuple(motions),
+        springs=_joined(springs) if springs else None,
+        loads=tuple(loads),
+    )
+
+
+class _Placed:
+    """One body's tets where it stands at the start.
+
+    where:  how messages name it
+    first:  its first vertex in the model
+    points: [n, 3] float64 m
+    tets:   [t, 4] and faces [f, 3], outward: from its own first vertex
+    """
+
+    def __init__(self, scene: Scene, body: Body, model: Model) -> None:
+        self.name = body.name
+        self.where = f"{scene.name}: bodies[{body.name}]"
+        self.first, end = body.vertex_range
+        self.points = model.vertices[self.first : end].astype(np.float64)
+        self.tets = model.tets[slice(*body.tet_range)] - np.int32(self.first)
+        self.faces, _ = boundary(self.tets)
+
+    @property
+    def size(self) -> float:
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    def select(self, region: Region, key: str) -> np.ndarray:
+        """Vertex ids in a region, from the body's first. Raises SceneError where there are none."""
+        try:
+            ids = np.flatnonzero(region.select(self.points))
+        except IndexError as error:
+            raise SceneError(
+                f"{self.where}.{key}.vertices: no vertex {error}; the body has {len(self.points)}, from 0"
+            ) from None
+        if not len(ids):
+            raise SceneError(f"{self.where}.{key}: the {region.describe()} holds no vertex; {self.span()}")
+        return ids
+
+    def span(self) -> str:
+        low, high = (np.round(corner, 3).tolist() for corner in (self.points.min(0), self.points.max(0)))
+        return f"the body spans {low} to {high} m"
+
+    def tetmesh(self) -> TetMesh:
+        fill = np.ones(len(self.tets), np.float32)
+        return TetMesh(self.points.astype(np.float32), self.tets.astype(np.int32), fill, "tetwild")
+
+
+def _pins(body: SceneBody, item: _Placed, pinned: np.ndarray, release: np.ndarray) -> Iterator[Motion]:
+    """Marks pinned vertices and their release times; yields what moves."""
+    owner = np.full(len(item.points), -1)
+    chosen = [item.select(pin, f"pins[{k}]") for k, pin in enumerate(body.pins)]
+    for k, (pin, ids) in enumerate(zip(body.pins, chosen, strict=True)):
+        for other in np.unique(owner[ids]).tolist():
+            if other >= 0 and not _agree(body.pins[other], chosen[other], pin, ids):
+                vertex = int(ids[owner[ids] == other][0])
+                raise SceneError(
+                    f"{item.where}: pins[{other}] and pins[{k}] both hold vertex {vertex} at "
+                    f"{np.round(item.points[vertex], 3).tolist()} m, but differ in motion or release; let "
+                    "their regions not overlap, or give both the same"
+                )
+        ids = ids[owner[ids] < 0]
+        owner[ids] = k
+        pinned[item.first + ids] = True
+        if pin.release is not None:
+            release[item.first + ids] = pin.release
+        if pin.motion and len(ids):
+            yield _motion(pin, item.points[chosen[k]].mean(axis=0), item.first + ids)
+
+
+def _agree(a: Pin, a_ids: np.ndarray, b: Pin, b_ids: np.ndarray) -> bool:
+    if (a.motion, a.pivot, a.release) != (b.motion, b.pivot, b.release):
+        return False
+    turns = a.pivot is None and any(any(key.rotation) for key in a.motion)
+    return not turns or np.array_equal(a_ids, b_ids)
+
+
+def _motion(pin: Pin, middle: np.ndarray, ids: np.ndarray) -> Motion:
+    keys = [(key.time, key.translation, key.rotation) for key in pin.motion]
+    if keys[0][0] > 0.0:
+        keys.insert(0, (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    return Motion(
+        vertices=ids.astype(np.int32),
+        pivot=middle if pin.pivot is None else np.asarray(pin.pivot),
+        times=np.array([time for time, _, _ in keys]),
+        translations=np.array([shift for _, shift, _ in keys]),
+        rotations=np.radians([turn for _, _, turn in keys]),
+    )
+
+
+def _loads(body: SceneBody, item: _Placed, model: Model) -> Iterator[Load]:
+    mass = _masses(item, model) if body.forces or body.impulses else np.zeros(0)
+    for k, force in enumerate(body.forces):
+        ids = item.select(force, f"forces[{k}]")
+        each = np.outer(mass[ids] / mass[ids].sum(), force.force)
+        end = FOREVER if force.end is None else force.end
+        yield Force((item.first + ids).astype(np.int32), each, force.start, end)
+    for k, push in enumerate(body.impulses):
+        ids = item.select(push, f"impulses[{k}]")
+        change = push.velocity
+        if push.impulse is not None:
+            change = tuple(part / mass[ids].sum() for part in push.impulse)
+        each = np.outer(mass[ids], np.asarray(change))
+        yield Impulse((item.first + ids).astype(np.int32), each, push.time)
+    for k, load in enumerate(body.pressures):
+        inside = np.zeros(len(item.points), bool)
+        inside[item.select(load, f"pressures[{k}]")] = True
+        faces = item.faces[inside[item.faces].all(axis=1)]
+        if not len(faces):
+            raise SceneError(
+                f"{item.where}.pressures[{k}]: the {load.describe()} holds no whole triangle of the surface; "
+                f"{item.span()}"
+            )
+        end = FOREVER if load.end is None else load.end
+        closed = len(faces) == len(item.faces)
+        yield Pressure(faces + item.first, load.pressure, closed, load.start, end)
+
+
+def _masses(item: _Placed, model: Model) -> np.ndarray:
+    """[n] kg of the body's vertices, a quarter of each element's."""
+    (ids,) = [body.tet_range for body in model.bodies if body.name == item.name]
+    corners = item.points[item.tets]
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+    mass = volume * model.fill[slice(*ids)] * model.density[slice(*ids)]
+    return np.bincount(item.tets.reshape(-1), weights=np.repeat(mass / 4.0, 4), minlength=len(item.points))
+
+
+def _spring(scene: Scene, k: int, spring: Spring, bodies: dict[str, _Placed]) -> Springs:
+    ends = [_end(f"{scene.name}: springs[{k}].ends[{e}]", end, bodies) for e, end in enumerate(spring.ends)]
+    length = spring.rest_length
+    if length is None:
+        length = float(np.linalg.norm(ends[0][3] - ends[1][3]))
+    each = [np.array([value]) for value in (spring.stiffness, length, spring.damping)]
+    corners, weights, anchors = (np.stack([[end[part] for end in ends]]) for part in range(3))
+    return Springs(corners, weights, anchors, *each)
+
+
+def _end(
+    where: str, end: SpringEnd, bodies: dict[str, _Placed]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Corners [4], weights [4], anchor [3] m, and where it is at the start [3] m."""
+    if end.body is None:
+        point = np.asarray(end.point)
+        return np.zeros(4, np.int32), np.zeros(4), point, point
+    body = bodies[end.body]
+    if end.vertex is not None:
+        if end.vertex >= len(body.points):
+            raise SceneError(
+                f"{where}.vertex: no vertex {end.vertex}; {end.body!r} has {len(body.points)}, from 0"
+            )
+        corners, weights = np.full(4, body.first + end.vertex), np.array([1.0, 0.0, 0.0, 0.0])
+        return corners.astype(np.int32), weights, np.zeros(3), body.points[end.vertex]
+    point = np.asarray(end.point)
+    away = float(distance_outside(point[None], body.points, body.faces)[0])
+    if away > END_OUTSIDE * body.size:
+        raise SceneError(f"{where}.point: lies {away:.3g} m outside {end.body!r}; {body.span()}")
+    corners, weights = _carried(body, point[None])
+    return corners[0], weights[0], np.zeros(3), point
+
+
+def _carried(body: _Placed, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners [n, 4] and weights [n, 4] of the elements that carry points [n, 3] m along."""
+    found = embed_surface(body.tetmesh(), points)
+    return (body.tets[found.tet_ids] + body.first).astype(np.int32), found.weights.astype(np.float64)
+
+
+def _ties(scene: Scene, k: int, ties: Attachment, bodies: dict[str, _Placed], model: Model) -> Springs:
+    a, b = (bodies[name] for name in ties.bodies)
+    where = f"{scene.name}: attachments[{k}]"
+    ids = np.unique(a.faces)
+    if ties.chosen:
+        ids = np.intersect1d(ids, a.select(ties, f"attachments[{k}]"))
+    away = distance_outside(a.points[ids], b.points, b.faces)
+    reach = TIE_DISTANCE * a.size if ties.distance is None else ties.distance
+    if not (away <= reach).any():
+        nearest = f"; the nearest is {away.min():.3g} m away" if len(ids) else ""
+        raise SceneError(
+            f"{where}: no chosen vertex on the surface of {a.name!r} lies within {reach:.3g} m of {b.name!r}"
+            f"{nearest}; move the bodies together, or raise `distance`"
+        )
+    ids = ids[away <= reach]
+    count = len(ids)
+    if ties.stiffness is None:
+        # Imported here: it brings the solver's kernels, which most scenes need not wait for yet.
+        from gdpro_sim.simulation.fem.rest import rest_shapes
+
+        stiffness = TIE_PER_ELASTIC * rest_shapes(model).stiffness[a.first + ids]
+    else:
+        stiffness = np.full(count, ties.stiffness / count)
+    corners, weights = np.zeros((count, 2, 4), np.int32), np.zeros((count, 2, 4))
+    corners[:, 0] = (a.first + ids)[:, None]
+    weights[:, 0, 0] = 1.0
+    corners[:, 1], weights[:, 1] = _carried(b, a.points[ids])
+    return Springs(
+        corners,
+        weights,
+        np.zeros((count, 2, 3)),
+        stiffness,
+        np.zeros(count),
+        np.full(count, ties.damping / count),
+    )
+
+
+def _joined(parts: list[Springs]) -> Springs:
+    return Springs(
+        *(
+            np.concatenate([getattr(part, key) for part in parts])
+            for key in ("corners", "weights", "anchors", "stiffness", "rest_length", "damping")
+        )
+    )
+
+
+def distance_outside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """How far each of `points` [n, 3] lies outside a closed surface, float64 [n] m; zero inside."""
+    index = SurfaceIndex(vertices, faces, winding=True)
+    face, weights = index.closest(points)
+    nearest = np.einsum("pc,pci->pi", weights.astype(np.float64), vertices[faces[face]])
+    return np.where(index.inside(points), 0.0, np.linalg.norm(points - nearest, axis=1))
+
+
+__all__ = ["apply_conditions", "distance_outside"]
