@@ -90,11 +90,11 @@ class BodyContact:
         self.frequency = self._frequency(rest)
         # On the host whatever the device: they are used there.
         self._stiffness = wp.full(1, self._base_stiffness, dtype=wp.float64, device="cpu")
-        self._reference = wp.array(surface.rest, dtype=wp.vec3d, device="cpu")
-        self._clearance = wp.array(self._rest_clearances(), dtype=wp.float64, device="cpu")
+        self._reference: wp.array = wp.array(surface.rest, dtype=wp.vec3d, device="cpu")
+        self._clearance: wp.array = wp.array(self._rest_clearances(), dtype=wp.float64, device="cpu")
         self._ccd = ipctk.AdditiveCCD()
         self._barrier = ipctk.BarrierPotential(self.gap, self._base_stiffness, True)
-        self._slip = wp.zeros(len(surface.ids), dtype=wp.vec3d, device="cpu")
+        self._share = wp.zeros(len(surface.ids), dtype=wp.vec3d, device="cpu")
         self._stencils: friction.Stencils | None = None
         self._start = surface.rest
         self._before = math.inf
@@ -140,7 +140,7 @@ class BodyContact:
         if tangential.empty():
             return None
         edges, faces = self.surface.edges, self.surface.faces
-        return friction.gather(tangential, positions, edges, faces, self._stick, self._slip.numpy())
+        return friction.gather(tangential, positions, edges, faces, self._stick, self._share.numpy())
 
     def energy(self, x: wp.array, energies: wp.array, first: int) -> None:
         positions = self.surface.positions(hosted(x))
@@ -189,11 +189,11 @@ class BodyContact:
         return float(candidates.compute_collision_free_stepsize(self._mesh, begin, end, 0.0, self._ccd))
 
     def finish(self, x: wp.array) -> None:
-        """Keep what the friction springs are stretched by."""
+        """Keep what the friction springs hold."""
         positions = self.surface.positions(hosted(x))
         stencils = self._gather(positions)
-        slip = self._slip.numpy()
-        slip[:] = 0.0 if stencils is None else friction.drag(stencils, positions - self._start)
+        share = self._share.numpy()
+        share[:] = 0.0 if stencils is None else friction.shares(stencils, positions - self._start)
 
     def stored(self, x: wp.array) -> float:
         positions = self.surface.positions(hosted(x))
@@ -204,7 +204,7 @@ class BodyContact:
 
     def state(self) -> dict[str, wp.array]:
         return {
-            "slip": self._slip,
+            "friction": self._share,
             "stiffness": self._stiffness,
             "reference": self._reference,
             "clearance": self._clearance,

@@ -2,9 +2,10 @@
 
 As on the ground (`gdpro_sim.kernels.contact`), friction is elastic-perfectly-plastic: for a fixed normal
 force its potential is Huber's in the slip, quadratic while it sticks and linear while it slides. Which
-elements touch changes from step to step, so the stretch of the springs is kept at the vertices: each holds
-the mean stretch of the contacts it takes part in, relative to what it touches, and a contact starts from the
-mean of its vertices'. What sticks everywhere keeps its stretch exactly, and does not creep.
+elements touch changes from step to step, so what the springs hold is kept at the vertices, as a share of
+Coulomb's limit: each vertex has the mean share of the contacts it takes part in, weighted by their limits,
+against what it touches, and a contact starts from the mean of its vertices'. The whole friction force is the
+same before and after as long as the normal forces are, so what sticks does not creep.
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ def gather(
     edges: np.ndarray,
     faces: np.ndarray,
     stiffness: np.ndarray,
-    slip: np.ndarray,
+    share: np.ndarray,
 ) -> Stencils:
     """Stencils of the toolkit's collisions at x [S, 3].
 
     stiffness: [S] N/m per m^2 of contact; a contact has the softer of its two sides'
-    slip:      [S, 3] m
+    share:     [S, 3] friction at the start of the step, as a share of its limit
     """
     count = len(tangential)
     ids, weights = np.zeros((count, 4), np.int64), np.zeros((count, 4))
@@ -63,8 +64,10 @@ def gather(
     normal = gap / np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-300)
     sides = np.stack([np.maximum(weights, 0.0), np.maximum(-weights, 0.0)])
     softer = np.einsum("ska,ka->sk", sides, stiffness[ids]).min(axis=0)
-    start = 0.5 * _tangential(np.einsum("ka,kai->ki", weights, slip[ids]), normal)
-    return Stencils(ids, weights, normal, limit, area * softer, start)
+    springs = area * softer
+    held = 0.5 * _tangential(np.einsum("ka,kai->ki", weights, share[ids]), normal)
+    start = (limit / np.maximum(springs, 1e-300))[:, None] * held
+    return Stencils(ids, weights, normal, limit, springs, start)
 
 
 def _tangential(vectors: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -128,17 +131,17 @@ def sum_blocks(rows: np.ndarray, columns: np.ndarray, blocks: np.ndarray, count:
     return sparse.bsr_matrix((summed, columns[first], offsets), shape=(3 * count, 3 * count))
 
 
-def drag(stencils: Stencils, moved: np.ndarray) -> np.ndarray:
-    """Stretch kept at the vertices after a step, [S, 3] m; springs past their limit slip back to it."""
+def shares(stencils: Stencils, moved: np.ndarray) -> np.ndarray:
+    """Friction after a step at the vertices, [S, 3], as a share of its limit; contacts hold no more."""
     stretch, length = _stretch(stencils, moved)
     most = stencils.limit / np.maximum(stencils.stiffness, 1e-300)
-    stretch = stretch * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-    share = np.abs(stencils.weights) * stencils.limit[:, None]
-    signed = (np.sign(stencils.weights) * share)[:, :, None] * stretch[:, None, :]
+    held = stretch / np.maximum(np.maximum(length, most), 1e-300)[:, None]
+    importance = np.abs(stencils.weights) * stencils.limit[:, None]
+    signed = (np.sign(stencils.weights) * importance)[:, :, None] * held[:, None, :]
     ids, count = stencils.ids.ravel(), len(moved)
-    total = np.bincount(ids, weights=share.ravel(), minlength=count)
+    total = np.bincount(ids, weights=importance.ravel(), minlength=count)
     sums = [np.bincount(ids, weights=signed[:, :, i].ravel(), minlength=count) for i in range(3)]
     return np.stack(sums, axis=1) / np.maximum(total, 1e-300)[:, None]
 
 
-__all__ = ["Stencils", "drag", "energy", "gather", "gradient", "hessian", "sum_blocks"]
+__all__ = ["Stencils", "energy", "gather", "gradient", "hessian", "shares", "sum_blocks"]
