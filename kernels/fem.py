@@ -107,12 +107,15 @@ def assemble_vertices(
     gradient: wp.array[wp.vec3d],
     block: wp.array[wp.mat33d],
     diagonal: wp.array[wp.int32],
+    factored: wp.array[wp.mat33d],
     # Out:
     force_out: wp.array[wp.vec3d],
     values_out: wp.array[wp.mat33d],
     inverse_diagonal_out: wp.array[wp.mat33d],
 ):
     """Negative gradient, diagonal block and its inverse of each vertex; terms stand in `gradient`, `block`.
+
+    `factored` are diagonal blocks of what is applied factor by factor: only the inverse has them.
 
     A fixed vertex gets no force and a zero inverse, which keeps conjugate gradients from ever moving it.
     """
@@ -134,6 +137,8 @@ def assemble_vertices(
         inverse_diagonal_out[i] = wp.mat33d()
     else:
         force_out[i] = -slope
+        if factored.shape[0] > 0:
+            curvature += factored[i]
         inverse_diagonal_out[i] = wp.inverse(curvature)
 
 

@@ -184,7 +184,11 @@ _CG_SERIAL = f"""
     double* const p = z + 4 * (size_t)rows;
     double* const q = p + 4 * (size_t)rows;
     double* const y = q + 4 * (size_t)rows;
+    double* const change = y + 4 * (size_t)rows;
     double* const scalars = scalars_out.data;
+    const bool averaged = curvature.shape[0] > 0;
+    const double* const forward_ = (const double*)forward.data;
+    const double* const transposed_ = (const double*)transposed.data;
 
     auto precondition = [&](int i) {{
         // The rows of a symmetric matrix are its columns.
@@ -258,6 +262,32 @@ _CG_SERIAL = f"""
             store(q + at, t);
             pq += dot(v, t);
         }}
+        if (averaged) {{
+            // q += G^T D G p
+            for (int i = 0; i < rows; ++i) {{
+                double total = 0.0;
+                for (int k = offsets.data[i]; k < offsets.data[i + 1]; ++k) {{
+                    const double* const g = forward_ + 3 * (size_t)k;
+                    const double* const v = p + 4 * (size_t)columns.data[k];
+                    total += g[0] * v[0] + g[1] * v[1] + g[2] * v[2];
+                }}
+                change[i] = curvature.data[i] * total;
+            }}
+            pq = 0.0;
+            for (int i = 0; i < rows; ++i) {{
+                const size_t at = 4 * (size_t)i;
+                D t = load(q + at);
+                for (int k = offsets.data[i]; k < offsets.data[i + 1]; ++k) {{
+                    const double* const g = transposed_ + 3 * (size_t)k;
+                    const double c = change[columns.data[k]];
+                    t[0] += c * g[0];
+                    t[1] += c * g[1];
+                    t[2] += c * g[2];
+                }}
+                store(q + at, t);
+                pq += dot(load(p + at), t);
+            }}
+        }}
         if (!(pq > 0.0)) break;
         const double alpha = rz / pq;
         const double previous = rz;
@@ -296,6 +326,9 @@ def cg_solve(
     extra_offsets: wp.array[wp.int32],
     extra_columns: wp.array[wp.int32],
     extra_values: wp.array[wp.mat33d],
+    forward: wp.array[wp.vec3d],
+    transposed: wp.array[wp.vec3d],
+    curvature: wp.array[wp.float64],
     inverse_diagonal: wp.array[wp.mat33d],
     right_hand_side: wp.array[wp.vec3d],
     work: wp.array[wp.float64],
@@ -318,6 +351,9 @@ def cg_serial(
     extra_offsets: wp.array[wp.int32],
     extra_columns: wp.array[wp.int32],
     extra_values: wp.array[wp.mat33d],
+    forward: wp.array[wp.vec3d],
+    transposed: wp.array[wp.vec3d],
+    curvature: wp.array[wp.float64],
     inverse_diagonal: wp.array[wp.mat33d],
     right_hand_side: wp.array[wp.vec3d],
     # Work:
@@ -343,6 +379,9 @@ def cg_serial(
         extra_offsets,
         extra_columns,
         extra_values,
+        forward,
+        transposed,
+        curvature,
         inverse_diagonal,
         right_hand_side,
         work,
@@ -394,6 +433,29 @@ def cg_direction(
 
 
 @wp.kernel
+def cg_change(
+    start: int,
+    # In:
+    rows: int,
+    blocks: int,
+    offsets: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    forward: wp.array[wp.vec3d],
+    curvature: wp.array[wp.float64],
+    p: wp.array[wp.vec3d],
+    # Out:
+    change_out: wp.array[wp.float64],
+):
+    """D G p"""
+    bounds = block_range(rows, blocks, start + wp.tid())
+    for i in range(bounds[0], bounds[1]):
+        total = wp.float64(0.0)
+        for k in range(offsets[i], offsets[i + 1]):
+            total += wp.dot(forward[k], p[columns[k]])
+        change_out[i] = curvature[i] * total
+
+
+@wp.kernel
 def cg_product(
     start: int,
     # In:
@@ -405,18 +467,23 @@ def cg_product(
     extra_offsets: wp.array[wp.int32],
     extra_columns: wp.array[wp.int32],
     extra_values: wp.array[wp.mat33d],
+    transposed: wp.array[wp.vec3d],
+    change: wp.array[wp.float64],
     p: wp.array[wp.vec3d],
     # Out:
     q_out: wp.array[wp.vec3d],
     dots_out: wp.array[wp.float64],
 ):
-    """q = A p, and p.q per block of rows."""
+    """q = A p, and p.q per block of rows. `change` is that of `cg_change`, or empty."""
     block = start + wp.tid()
     bounds = block_range(rows, blocks, block)
     total = wp.float64(0.0)
     for i in range(bounds[0], bounds[1]):
         q = row_product(offsets[i], offsets[i + 1], columns, values, p)
         q += row_product(extra_offsets[i], extra_offsets[i + 1], extra_columns, extra_values, p)
+        if change.shape[0] > 0:
+            for k in range(offsets[i], offsets[i + 1]):
+                q += change[columns[k]] * transposed[k]
         q_out[i] = q
         total += wp.dot(p[i], q)
     dots_out[block] = total

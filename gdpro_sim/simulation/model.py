@@ -55,6 +55,9 @@ class FemSettings:
     newton_tolerance:  stop when a full Newton step moves no vertex by more than this times dt, m/s
     cg_iterations:     most inner conjugate gradient iterations per Newton iteration
     cg_tolerance:      relative (preconditioned) residual of the inner conjugate gradients
+    volumes:           "nodal" averages volume changes over the elements around each vertex, which keeps
+                       nearly incompressible bodies from locking; "element" does not; "auto" averages where
+                       Poisson's ratio is 0.45 or more. The linear law never does
     contact_stiffness: multiple of the ground penalty stiffness that the solver derives from each body's
                        own elasticity and weight
     contact_gap:       distance that contact between bodies keeps, as a fraction of the smallest body's size
@@ -68,6 +71,7 @@ class FemSettings:
     newton_tolerance: float = 1e-3
     cg_iterations: int = 2000
     cg_tolerance: float = 1e-2
+    volumes: Literal["auto", "nodal", "element"] = "auto"
     contact_stiffness: float = 1.0
     contact_gap: float = 1e-3
     body_contact: bool = True

@@ -44,12 +44,14 @@ class ConjugateGradient:
         self.offsets: wp.array = wp.array(topology.offsets, dtype=wp.int32, device=device)
         self.columns: wp.array = wp.array(topology.columns, dtype=wp.int32, device=device)
         self._diagonal: wp.array = wp.array(topology.diagonal, dtype=wp.int32, device=device)
-        self._work = wp.zeros(20 * self.rows, dtype=wp.float64, device=device)
+        self._work = wp.zeros(21 * self.rows, dtype=wp.float64, device=device)
         self.values = wp.zeros(len(topology.columns), dtype=wp.mat33d, device=device)
         self._extra_offsets = wp.zeros(self.rows + 1, dtype=wp.int32, device=device)
         self._extra_columns = wp.zeros(0, dtype=wp.int32, device=device)
         self._extra_values = wp.zeros(0, dtype=wp.mat33d, device=device)
         self._coupled = False
+        self._forward = self._transposed = wp.zeros(0, dtype=wp.vec3d, device=device)
+        self._curvature = self._change = wp.zeros(0, dtype=wp.float64, device=device)
         self.inverse_diagonal = wp.zeros(self.rows, dtype=wp.mat33d, device=device)
         self.right_hand_side, self.solution, self.residual, self._z, self._p, self._q = (
             wp.zeros(self.rows, dtype=wp.vec3d, device=device) for _ in range(6)
@@ -88,6 +90,27 @@ class ConjugateGradient:
             wp.copy(self._extra_values, values, count=count)
         self._coupled = True
 
+    def average(self, forward: wp.array, transposed: wp.array, curvature: wp.array) -> None:
+        """Add G^T D G to A, factor by factor, for good; the arrays are read anew in every solve.
+
+        forward, transposed: [N] vec3d, G (row by row) and its transpose, in the order of `Topology.columns`
+        curvature:           [P] D
+        """
+        self._forward, self._transposed, self._curvature = forward, transposed, curvature
+        self._change = wp.zeros(self.rows, dtype=wp.float64, device=self.device)
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        """A x for x [P, 3], float64."""
+        found = (self.matrix() @ x.reshape(-1)).reshape(-1, 3)
+        if len(self._change):
+            offsets, columns = self.offsets.numpy(), self.columns.numpy()
+            rows = np.repeat(np.arange(self.rows), np.diff(offsets))
+            change = np.bincount(rows, (self._forward.numpy() * x[columns]).sum(1), self.rows)
+            change *= self._curvature.numpy()
+            back = self._transposed.numpy() * change[columns, None]
+            found += np.stack([np.bincount(rows, back[:, k], self.rows) for k in range(3)], 1)
+        return found
+
     def solve(self, tolerance: float, max_iterations: int) -> SolveReport:
         """Solve until the preconditioned residual has fallen by `tolerance`, starting from zero."""
         if self.serial:
@@ -112,6 +135,9 @@ class ConjugateGradient:
                 self._extra_offsets,
                 self._extra_columns,
                 self._extra_values,
+                self._forward,
+                self._transposed,
+                self._curvature,
                 self.inverse_diagonal,
                 self.right_hand_side,
             ],
@@ -132,6 +158,9 @@ class ConjugateGradient:
             if iteration % check_every == 0 and self._scalars.numpy()[linalg.CG_DONE] != 0.0:
                 break
             self._over_rows(linalg.cg_direction, [self._z, self._scalars], [self._p])
+            if len(self._change):
+                inputs = [self.offsets, self.columns, self._forward, self._curvature, self._p]
+                self._over_rows(linalg.cg_change, inputs, [self._change])
             self._over_rows(
                 linalg.cg_product,
                 [
@@ -141,6 +170,8 @@ class ConjugateGradient:
                     self._extra_offsets,
                     self._extra_columns,
                     self._extra_values,
+                    self._transposed,
+                    self._change,
                     self._p,
                 ],
                 [self._q, self._dots],
@@ -190,7 +221,10 @@ class ConjugateGradient:
         command.launch()
 
     def matrix(self) -> Any:
-        """A as a scipy BSR matrix; on the CPU it shares the memory of `values` where nothing is coupled."""
+        """A without G^T D G as a scipy BSR matrix.
+
+        On the CPU it shares the memory of `values` where nothing is coupled.
+        """
         from scipy.sparse import bsr_matrix
 
         count = 3 * self.rows

@@ -10,6 +10,7 @@ import warp as wp
 from gdpro_sim.device import Launches
 from gdpro_sim.kernels import element_lanes, elements, fem, linalg
 from gdpro_sim.simulation.fem.conjugate_gradient import ConjugateGradient
+from gdpro_sim.simulation.fem.nodal_pressure import NodalPressure, kept_lambda
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
 from gdpro_sim.simulation.fem.term import Step, Term
 from gdpro_sim.simulation.fem.topology import BLOCKS_PER_ELEMENT, build_topology
@@ -61,7 +62,8 @@ class IncrementalPotential:
         self.elements.plastic_strain = wp.zeros(t, dtype=wp.float64, device=device)
         self.elements.pressure = wp.zeros(t, dtype=wp.float64, device=device)
         self.elements.mu = reals(rest.mu, device)
-        self.elements.lam = reals(rest.lam, device)
+        kept = kept_lambda(model, rest)
+        self.elements.lam = reals(kept, device)
         self.elements.damping = reals(model.rayleigh_stiffness, device)
 
         self.vertices = fem.Vertices()
@@ -75,6 +77,7 @@ class IncrementalPotential:
             wp.zeros(p, dtype=wp.vec3d, device=device) for _ in range(6)
         )
         self._block = wp.zeros(p, dtype=wp.mat33d, device=device)
+        self._no_blocks = wp.zeros(0, dtype=wp.mat33d, device=device)
         self._cauchy_green = wp.zeros(t, dtype=wp.mat33d, device=device)
         self.element_gradient = wp.zeros(4 * t, dtype=wp.vec3d, device=device)
         self._element_blocks = wp.zeros(BLOCKS_PER_ELEMENT * t, dtype=wp.mat33d, device=device)
@@ -83,9 +86,14 @@ class IncrementalPotential:
         self._work = wp.zeros(
             self._groups * self._lanes * int(element_lanes.WORK), dtype=wp.float64, device=device
         )
-        self._energies = wp.zeros(
-            t + p + sum(term.energies for term in terms), dtype=wp.float64, device=device
-        )
+        self._averaged = None
+        if np.any(kept < rest.lam):
+            self._averaged = NodalPressure(
+                model, rest, topology, self.elements, self.system.offsets, self.system.columns
+            )
+            self.system.average(self._averaged.forward, self._averaged.transposed, self._averaged.curvature)
+        count = t + p + sum(term.energies for term in terms) + (p if self._averaged else 0)
+        self._energies = wp.zeros(count, dtype=wp.float64, device=device)
         self._sums, self._maxima = (wp.zeros(RANGES, dtype=wp.float64, device=device) for _ in range(2))
         self._diagonal: wp.array = wp.array(topology.diagonal, dtype=wp.int32, device=device)
         self._pairs: list[wp.array] = [
@@ -142,6 +150,8 @@ class IncrementalPotential:
         if not elements_unchanged:
             inputs = [self.elements, x, self._cauchy_green, self._inverse_h]
             self.over_elements(elements.element_energy, inputs, [self._energies])
+            if self._averaged is not None:
+                self._averaged.energy(x, self._energies, len(self._energies) - self.vertex_count)
         first = self.element_count
         inputs = [first, self.vertices, x, self.base, self.inertia, self._inverse_h]
         self.over_vertices(fem.vertex_energy, inputs, [self._energies])
@@ -154,6 +164,7 @@ class IncrementalPotential:
     def linearise(self, x: wp.array) -> None:
         """Fill the linear system H d = -gradient at x."""
         system = self.system
+        self._press(x)
         self.differentiate_elements(x)
         self._launch(
             linalg.gather_off_diagonal,
@@ -162,6 +173,8 @@ class IncrementalPotential:
             [system.values],
         )
         system.couple(self._add_terms(x))
+        if self._averaged is not None:
+            self._averaged.linearise()
         self.over_vertices(
             fem.assemble_vertices,
             [
@@ -175,6 +188,7 @@ class IncrementalPotential:
                 self.gradient,
                 self._block,
                 self._diagonal,
+                self._no_blocks if self._averaged is None else self._averaged.blocks,
             ],
             [system.right_hand_side, system.values, system.inverse_diagonal],
         )
@@ -189,8 +203,13 @@ class IncrementalPotential:
             minimum=64,
         )
 
+    def _press(self, x: wp.array) -> None:
+        if self._averaged is not None:
+            self._averaged.press(x)
+
     def forces(self, x: wp.array) -> None:
         """Gradients of elements and terms at x, without inertia, into element_gradient and gradient."""
+        self._press(x)
         inputs = [self.elements, x, self._cauchy_green, self._inverse_h]
         self.over_elements(elements.element_gradient, inputs, [self.element_gradient])
         self._add_terms(x)
@@ -253,7 +272,11 @@ class IncrementalPotential:
         """Energy stored in the elements at x, J."""
         inputs = [self.elements, x, self._cauchy_green, 0.0]
         self.over_elements(elements.element_energy, inputs, [self._energies])
-        return float(self._energies.numpy()[: self.element_count].sum())
+        stored = float(self._energies.numpy()[: self.element_count].sum())
+        if self._averaged is not None:
+            self._averaged.energy(x, self._energies, len(self._energies) - self.vertex_count)
+            stored += float(self._energies.numpy()[-self.vertex_count :].sum())
+        return stored
 
     def flow(self, x: wp.array) -> None:
         """Let elements past their yield stress keep the plastic part of their deformation at x."""
