@@ -15,7 +15,8 @@ Solberg 2006, "A stabilized nodally integrated tetrahedral", Int. J. Num. Meth. 
 With p_n = k_n f'(v_n / V_n) the force is that of a pressure p_e, the mean of p_n over the element's corners.
 Its derivative has two parts: p_e d2J_e, which the elements take into their own projected Hessians, and
 
-    G^T D G,  G_ni = dv_n / dx_i = 1/4 sum_{e at n and i} V_e cof F_e grad N_i,  D_n = k_n f''(v_n / V_n) / V_n
+    G^T D G,  G_ni = dv_n / dx_i = 1/4 sum_{e at n and i} V_e cof F_e grad N_i,
+              D_n = k_n f''(v_n / V_n) / V_n
 
 with f'' taken as positive: semidefinite, and applied factor by factor, since its own pattern is far denser.
 """
