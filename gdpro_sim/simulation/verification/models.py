@@ -39,18 +39,19 @@ def tet_grid(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, n
 
 
 def tet_ball(cells: int, radius: float, grading: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A ball around the origin: the cube of `cells`^3 cells pushed out along rays, see `tet_box`.
+    """A ball around the origin: the cube of `cells`^3 cells, smoothly rounded, see `tet_box`.
 
     grading: 0 for even cells; larger ones crowd them around the lowest point, (0, 0, -radius)
     """
     even = np.linspace(-1.0, 1.0, cells + 1)
-    sideways = np.sinh(grading * even) / np.sinh(grading) if grading > 0.0 else even
-    upward = np.expm1(0.5 * grading * (even + 1.0)) / np.expm1(grading) * 2.0 - 1.0 if grading > 0.0 else even
+    sideways, upward = even, even
+    if grading > 0.0:
+        sideways = np.sinh(grading * even) / np.sinh(grading)
+        upward = 2.0 * np.expm1(0.5 * grading * (even + 1.0)) / np.expm1(grading) - 1.0
     cube, tets = tet_grid(sideways, sideways, upward)
-    length = np.linalg.norm(cube, axis=1)
-    shell = np.abs(cube).max(axis=1)
-    # Equal angles near the surface, straight cells near the middle.
-    return radius * cube * np.divide(shell, length, out=np.ones(len(cube)), where=length > 0.0)[:, None], tets
+    squares = cube**2
+    a, b = squares[:, [1, 2, 0]], squares[:, [2, 0, 1]]
+    return radius * cube * np.sqrt(1.0 - a / 2.0 - b / 2.0 + a * b / 3.0), tets
 
 
 def make_model(

@@ -1,0 +1,148 @@
+"""FEM on the ground: pressing, sliding, bouncing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from gdpro_sim.simulation.fem import SolverFEM
+from gdpro_sim.simulation.model import Ground
+from gdpro_sim.simulation.verification.framework import Check, at_least, at_most, problem, relative
+from gdpro_sim.simulation.verification.models import make_model, tet_ball, tet_box
+from gdpro_sim.simulation.verification.probe import Probe, settled
+
+GRAVITY = 9.81
+
+
+@problem(
+    "hertz",
+    title="An elastic ball of radius 0.1 m pressed on the ground by its own weight",
+    source="Hertz: F = 4/3 E* sqrt(R) d^1.5, a = sqrt(R d), E* = E / (1 - nu^2) (Johnson, section 4.2)",
+)
+def hertz() -> Iterator[Check]:
+    radius, young, poisson, cells = 0.1, 1e5, 0.3, 10
+    modulus = young / (1.0 - poisson**2)
+    vertices, tets = tet_ball(cells, radius, grading=2.5)
+    for share in (0.02, 0.03):
+        depth = share * radius
+        force = 4.0 / 3.0 * modulus * np.sqrt(radius) * depth**1.5
+        options: dict[str, Any] = {"young": young, "poisson": poisson, "friction": 0.0}
+        bare = Probe(make_model(vertices, tets, density=1.0, **options))
+        density = force / GRAVITY / float(bare.mass.sum())
+        model = make_model(
+            vertices,
+            tets,
+            density=density,
+            ground=Ground(-radius),
+            integrator="quasi-static",
+            newton_tolerance=1e-5,
+            newton_iterations=60,
+            **options,
+        )
+        x = settled(model)
+        probe = Probe(model)
+        # What the elements and the weight leave over is what the ground pushes with.
+        push = probe.forces(x)[:, 2] + GRAVITY * probe.mass
+        yield relative(f"force on the ground, d = {share:g} R", force, push.sum(), 1e-3, "N")
+        centre = float(np.average(x[:, 2], weights=probe.mass))
+        yield relative(f"indentation, {len(tets)} tets", depth, -centre, 0.1, "m")
+        # The second moment of Hertz's pressure is 2/5 a^2.
+        outward = (x[:, :2] ** 2).sum(axis=1)
+        half_width = float(np.sqrt(2.5 * (push * outward).sum() / push.sum()))
+        yield relative(
+            f"half-width of the contact, {len(tets)} tets", np.sqrt(radius * depth), half_width, 0.1, "m"
+        )
+
+
+def _tilted(angle: float) -> tuple[float, float, float]:
+    """Gravity as seen from a plane that slopes down along x at `angle` rad."""
+    return (GRAVITY * float(np.sin(angle)), 0.0, -GRAVITY * float(np.cos(angle)))
+
+
+@problem(
+    "incline",
+    title="A block on an incline, friction 0.5: it holds below atan mu = 26.57 degrees and slides above",
+    source="Coulomb: rest, or a = g (sin - mu cos); gravity is tilted instead of the ground",
+)
+def incline() -> Iterator[Check]:
+    friction, size = 0.5, 0.5
+    vertices, tets = tet_box((3, 3, 3), (size,) * 3)
+    limit = np.degrees(np.arctan(friction))
+
+    def slope(degrees: float) -> SolverFEM:
+        model = make_model(
+            vertices,
+            tets,
+            young=1e6,
+            friction=friction,
+            gravity=_tilted(np.radians(degrees)),
+            ground=Ground(),
+            rayleigh_stiffness=1e-2,
+        )
+        solver = SolverFEM(model)
+        for _ in range(60):
+            solver.step(1 / 60)
+        return solver
+
+    for degrees in (limit - 5.0, limit - 1.0):
+        solver = slope(degrees)
+        before = solver.positions[:, 0].mean()
+        for _ in range(120):
+            solver.step(1 / 60)
+        creep = solver.positions[:, 0].mean() - before
+        yield at_most(f"{degrees:.2f} degrees: creep in 2 s once settled", 1e-5, creep, "m")
+    for degrees in (limit + 1.0, 35.0):
+        solver = slope(degrees)
+        before = solver.velocities[:, 0].mean()
+        for _ in range(60):
+            solver.step(1 / 60)
+        angle = np.radians(degrees)
+        expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle))
+        speed = solver.velocities[:, 0].mean() - before
+        yield relative(f"{degrees:.2f} degrees: acceleration", expected, speed / 1.0, 0.02, "m/s^2")
+
+
+@problem(
+    "restitution",
+    title="A ball falls by 0.5 m and bounces: the more damping, the lower",
+    source="stiffness damping takes energy from every deformation; without any, waves in the ball keep some",
+)
+def restitution() -> Iterator[Check]:
+    radius, fall = 0.1, 0.5
+    vertices, tets = tet_ball(6, radius)
+    before = None
+    for damping in (0.0, 1e-3, 3e-3, 1e-2):
+        model = make_model(
+            vertices,
+            tets,
+            young=5e5,
+            rayleigh_stiffness=damping,
+            velocities=np.tile([0.0, 0.0, -np.sqrt(2.0 * GRAVITY * fall)], (len(vertices), 1)),
+            ground=Ground(-radius - 1e-3),
+            integrator="bdf2",
+            substeps=8,
+        )
+        solver, mass = SolverFEM(model), Probe(model).mass
+        touched = False
+        for _ in range(120):
+            solver.step(1 / 240)
+            contacts = solver.diagnostics().contacts
+            touched |= contacts > 0
+            if touched and contacts == 0:
+                break
+        speed = float(np.average(solver.velocities[:, 2], weights=mass))
+        ratio = speed / np.sqrt(2.0 * GRAVITY * fall)
+        if before is None:
+            yield at_least("restitution, no damping", 0.8, ratio)
+            yield at_most("restitution, no damping", 1.0, ratio)
+        else:
+            yield at_most(f"change of the restitution with damping {damping:g} s", -0.02, ratio - before)
+        before = ratio
+    yield at_least("restitution at the largest damping", 0.0, ratio)
+
+
+PROBLEMS = (hertz, incline, restitution)
+
+__all__ = ["PROBLEMS"]

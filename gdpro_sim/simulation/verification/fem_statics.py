@@ -1,0 +1,317 @@
+"""FEM where nothing moves: elements, materials, beams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy.optimize import brentq
+
+from gdpro_sim.simulation.verification.beams import Beam
+from gdpro_sim.simulation.verification.framework import Check, absolute, at_least, at_most, problem, relative
+from gdpro_sim.simulation.verification.models import make_model, tet_box
+from gdpro_sim.simulation.verification.probe import TIGHT, Probe, order, settled, start, without_locking
+from gdpro_sim.simulation.verification.reference import ReferenceFem
+
+POISSON = float(np.float32(0.3))
+"""As a model stores it."""
+
+AFFINE = np.array([[1.2, 0.1, 0.0], [0.05, 0.9, -0.1], [0.0, 0.2, 1.1]])
+
+
+def _uneven_box(cells: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, tets and which vertices lie inside; those are moved so that no two elements are alike."""
+    vertices, tets = tet_box((cells,) * 3, (size,) * 3)
+    inside = np.all((vertices > 1e-9) & (vertices < size - 1e-9), axis=1)
+    vertices[inside] += 0.04 * size / cells * np.random.default_rng(0).normal(size=(int(inside.sum()), 3))
+    return vertices.astype(np.float32).astype(np.float64), tets, inside
+
+
+@problem(
+    "patch",
+    title="An affine deformation is an equilibrium of any mesh",
+    source="Irons & Razzaque 1972: x = A X at the boundary gives F = A everywhere, no force inside",
+)
+def patch() -> Iterator[Check]:
+    vertices, tets, inside = _uneven_box(3, 0.5)
+    model = make_model(
+        vertices, tets, young=1e5, pinned=~inside, gravity=(0, 0, 0), integrator="quasi-static", **TIGHT
+    )
+    exact = vertices @ AFFINE.T
+    force = np.linalg.norm(Probe(model).forces(exact), axis=1)
+    yield at_most(
+        "force inside / force at the boundary, 27 uneven cells", 1e-12, force[inside].max() / force.max()
+    )
+    disturbed = exact.copy()
+    disturbed[inside] += 0.01 * np.random.default_rng(1).normal(size=(int(inside.sum()), 3))
+    found = settled(model, disturbed)
+    yield at_most("solved from a disturbed start: off by", 1e-9, np.abs(found - exact).max(), "m")
+
+
+@problem(
+    "uniaxial",
+    title="A bar stretched freely: lateral stretch and nominal stress, stable neo-Hookean",
+    source="Smith et al. 2018, eq. 13: mu s + (L (l s^2 - 1) - mu) l s = 0, L = lambda + mu; PHYSICS.md",
+)
+def uniaxial() -> Iterator[Check]:
+    young = 1e5
+    vertices, tets = tet_box((2, 2, 2), (1.0, 1.0, 1.0))
+    probe = Probe(make_model(vertices, tets, young=young))
+    lam, mu = young * POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), young / (2 * (1 + POISSON))
+    right, back = vertices[:, 0] == 1.0, vertices[:, 1] == 1.0
+
+    for stretch in (0.7, 0.9, 1.1, 1.5, 2.0):
+
+        def face_forces(s: float, stretch: float = stretch) -> tuple[float, float]:
+            forces = probe.forces(vertices * [stretch, s, s])
+            return float(forces[right, 0].sum()), float(forces[back, 1].sum())
+
+        # (lam + mu) l^2 s^3 - (lam + 2 mu) l s + mu s = 0, s > 0
+        lateral = np.sqrt(((lam + 2 * mu) * stretch - mu) / (lam + mu)) / stretch
+        stress = mu * stretch + ((lam + mu) * (stretch * lateral**2 - 1.0) - mu) * lateral**2
+        found = brentq(lambda s: face_forces(s)[1], 0.5, 1.5, xtol=1e-14)
+        yield absolute(f"lateral stretch at {stretch:g}", lateral, found, 1e-9)
+        yield absolute(f"P11 / E at {stretch:g}", stress / young, face_forces(found)[0] / young, 1e-9)
+
+
+@problem(
+    "shear",
+    title="Simple shear: stresses from reactions of a solved block, stable neo-Hookean",
+    source="J = 1: P = mu (F - F^-T), so that P12 = P21 = mu gamma and P11 = P22 = 0",
+)
+def shear() -> Iterator[Check]:
+    young = 1e5
+    mu = young / (2 * (1 + POISSON))
+    vertices, tets, inside = _uneven_box(3, 1.0)
+    model = make_model(
+        vertices, tets, young=young, pinned=~inside, gravity=(0, 0, 0), integrator="quasi-static", **TIGHT
+    )
+    probe = Probe(model)
+    for gamma in (0.1, 0.5, 1.0):
+        x = vertices @ np.array([[1.0, gamma, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).T
+        forces = probe.forces(settled(model, x))
+        stress = forces.T @ vertices  # the virial: the integral of P over the block of 1 m^3
+        yield relative(f"P12 / mu at {gamma:g}", gamma, stress[0, 1] / mu, 1e-8)
+        yield relative(f"P21 / mu at {gamma:g}", gamma, stress[1, 0] / mu, 1e-8)
+        yield absolute(f"P22 / mu at {gamma:g}", 0.0, stress[1, 1] / mu, 1e-8)
+
+
+def _cantilever(beam: Beam, cells: int, *, tip_load: float = 0.0) -> dict[str, np.ndarray]:
+    """Mesh of `cells` across the section and cubes along, pins, tip vertices, density per element."""
+    along = round(cells * beam.length / beam.side)
+    vertices, tets = tet_box((along, cells, cells), (beam.length, beam.side, beam.side))
+    density = np.full(len(tets), beam.density)
+    if tip_load > 0.0:
+        last = vertices[tets, 0].min(axis=1) > beam.length - 1.5 * beam.length / along
+        density[last] = tip_load / 9.81 / (beam.side**2 * beam.length / along)
+        density[~last] = 1e-3
+    return {
+        "vertices": vertices,
+        "tets": tets,
+        "density": density,
+        "pinned": vertices[:, 0] == 0.0,
+        "tip": np.isclose(vertices[:, 0], beam.length),
+    }
+
+
+def _drop(beam: Beam, mesh: dict[str, np.ndarray], **options: str) -> tuple[float, float]:
+    """(reach, drop) of the middle of the tip under gravity, m, by the quasi-static solver."""
+    model = make_model(
+        mesh["vertices"],
+        mesh["tets"],
+        young=beam.young,
+        poisson=beam.poisson,
+        density=mesh["density"],
+        pinned=mesh["pinned"],
+        integrator="quasi-static",
+        newton_tolerance=1e-6,
+        newton_iterations=60,
+    )
+    x = settled(model)[mesh["tip"]].mean(axis=0)
+    return float(x[0]), float(beam.side / 2 - x[2])
+
+
+def _reference_drop(beam: Beam, mesh: dict[str, np.ndarray]) -> tuple[float, float]:
+    """The same by the float64 oracle."""
+    oracle = ReferenceFem(
+        mesh["vertices"], mesh["tets"], beam.young, beam.poisson, mesh["density"], mesh["pinned"]
+    )
+    x = oracle.equilibrium()[mesh["tip"]].mean(axis=0)
+    return float(x[0]), float(beam.side / 2 - x[2])
+
+
+STUBBY = Beam(length=1.0, side=0.2, young=1e7, poisson=0.3, density=1000.0)
+"""The cantilever of PHYSICS.md."""
+
+SLENDER = Beam(length=1.0, side=0.1, young=2e6, poisson=0.3, density=1000.0)
+"""Sags by half of its length."""
+
+
+@problem(
+    "cantilever",
+    title="A cantilever of 1 x 0.2 x 0.2 m, E = 1e7 Pa, sags a little under its own weight",
+    source="Timoshenko: w L^4 / 8 EI + w L^2 / 2 kappa G A; float64 reference with a direct solver",
+)
+def cantilever() -> Iterator[Check]:
+    sags, cells = [], [4, 6, 8]
+    for across in cells:
+        mesh = _cantilever(STUBBY, across)
+        sags.append(_drop(STUBBY, mesh)[1])
+        if across == 4:
+            quantity = f"tip sag, {len(mesh['tets'])} tets, reference on the same mesh"
+            yield relative(quantity, _reference_drop(STUBBY, mesh)[1], sags[-1], 0.01, "m")
+    yield at_least("sag of 8 cells across less that of 6: locking eases", 0.0, sags[2] - sags[1], "m")
+    quantity = "tip sag, 4, 6 and 8 cells across, locking extrapolated away"
+    yield relative(quantity, STUBBY.sag(), without_locking(cells, sags), 0.03, "m")
+
+
+@problem(
+    "cantilever-tip",
+    title="The same cantilever without weight, 100 N at its tip",
+    source="Timoshenko: F a^2 (3 L - a) / 6 EI + F a / kappa G A, a the middle of the last cells",
+)
+def cantilever_tip() -> Iterator[Check]:
+    sags, expected, cells = [], [], [4, 6, 8]
+    for across in cells:
+        mesh = _cantilever(STUBBY, across, tip_load=100.0)
+        sags.append(_drop(STUBBY, mesh)[1])
+        at = STUBBY.length - 0.5 * STUBBY.side / across
+        expected.append(STUBBY.tip_deflection(100.0, at))
+        if across == 4:
+            quantity = f"tip deflection, {len(mesh['tets'])} tets, reference on the same mesh"
+            yield relative(quantity, _reference_drop(STUBBY, mesh)[1], sags[-1], 0.01, "m")
+    ratios = [sag / theory for sag, theory in zip(sags, expected, strict=True)]
+    quantity = "deflection / theory, 4, 6 and 8 cells across, locking extrapolated away"
+    yield relative(quantity, 1.0, without_locking(cells, ratios), 0.03)
+
+
+@problem(
+    "elastica",
+    title="A cantilever of 1 x 0.1 x 0.1 m, E = 2e6 Pa, sags by half its length under its own weight",
+    source="the heavy elastica EI theta'' = -w (L - s) cos theta, solved with scipy's solve_bvp (Rohde 1953)",
+)
+def elastica() -> Iterator[Check]:
+    cells, drops, reaches = [2, 3, 4], [], []
+    for across in cells:
+        mesh = _cantilever(SLENDER, across)
+        reach, drop = _drop(SLENDER, mesh)
+        drops.append(drop)
+        reaches.append(reach)
+        if across == 2:
+            expected = _reference_drop(SLENDER, mesh)
+            at = f"{len(mesh['tets'])} tets, reference on the same mesh"
+            yield relative(f"drop of the tip, {at}", expected[1], drop, 0.01, "m")
+            yield relative(f"reach of the tip, {at}", expected[0], reach, 0.01, "m")
+    reach, drop = SLENDER.elastica()
+    at = "2, 3 and 4 cells across, locking extrapolated away"
+    yield relative(f"drop of the tip, {at}", drop, without_locking(cells, drops), 0.03, "m")
+    # The reach falls short by the square of the slope.
+    short = without_locking(cells, list(np.sqrt(SLENDER.length - np.array(reaches)))) ** 2
+    yield relative(f"reach of the tip, {at}", reach, SLENDER.length - short, 0.03, "m")
+
+
+@problem(
+    "torsion",
+    title="A bar of 1 x 0.2 x 0.2 m twisted by 0.05 rad",
+    source="Saint-Venant: T = 0.1406 G h^4 theta / L (Timoshenko & Goodier, section 109); ends cannot warp",
+)
+def torsion() -> Iterator[Check]:
+    angle, cells, torques = 0.05, [4, 6, 8], []
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for across in cells:
+        mesh = _cantilever(STUBBY, across)
+        vertices, tip = mesh["vertices"], mesh["tip"]
+        model = make_model(
+            vertices,
+            mesh["tets"],
+            young=STUBBY.young,
+            poisson=STUBBY.poisson,
+            pinned=mesh["pinned"] | tip,
+            gravity=(0, 0, 0),
+            integrator="quasi-static",
+            **TIGHT,
+        )
+        middle = np.array([0.0, 0.1, 0.1])
+        twisted = vertices - middle
+        share = vertices[:, :1] / STUBBY.length
+        twisted[:, 1:] += share * (twisted[:, 1:] @ turn.T - twisted[:, 1:])
+        x = settled(model, twisted + middle)
+        force = Probe(model).forces(x)[tip]
+        torques.append(float(np.cross(x[tip] - middle, force)[:, 0].sum()))
+    expected = STUBBY.torque(angle)
+    for across, torque in zip(cells, torques, strict=True):
+        yield at_least(f"torque / theory, {across} cells across", 1.0, torque / expected)
+    yield at_most("fall of that from 6 to 8 cells", 0.0, (torques[2] - torques[1]) / expected)
+    limit = 1.0 / without_locking(cells, [1.0 / torque for torque in torques])
+    yield relative("torque, extrapolated", expected, limit, 0.03, "N m")
+
+
+@problem(
+    "static-dt",
+    title="Where a damped cantilever comes to rest does not depend on the step length",
+    source="equilibrium has no time in it: quasi-static solution of the same mesh",
+)
+def static_dt() -> Iterator[Check]:
+    mesh = _cantilever(STUBBY, 2)
+    options: dict[str, Any] = {
+        "young": 1e6,
+        "pinned": mesh["pinned"],
+        "rayleigh_mass": 20.0,
+        "substeps": 1,
+        "newton_tolerance": 1e-8,
+        "cg_tolerance": 1e-6,
+    }
+    vertices, tets = mesh["vertices"], mesh["tets"]
+    rest = settled(make_model(vertices, tets, **{**options, "integrator": "quasi-static"}))
+    yield at_least("sag of the tip", 0.1, (vertices - rest)[mesh["tip"], 2].mean(), "m")
+    for dt, steps in ((1 / 60, 150), (1 / 24, 80), (0.2, 40), (2.0, 15)):
+        solver = start(make_model(vertices, tets, **options))
+        for _ in range(steps):
+            solver.step(dt)
+        yield at_most(
+            f"off the quasi-static solution after {steps} steps of {dt:.3g} s",
+            1e-6,
+            np.abs(solver.positions - rest).max(),
+            "m",
+        )
+
+
+@problem(
+    "order-h",
+    title="Displacements converge with the square of the mesh size",
+    source="linear elements: O(h^2) in displacements (Strang & Fix 1973); exact: u = grad phi, phi harmonic",
+)
+def order_h() -> Iterator[Check]:
+    # Without body force, u = grad phi with laplace phi = 0 solves linear elasticity; it is small, so that
+    # the law is linear there: phi = exp(k x) sin(k y / sqrt 2) sin(k z / sqrt 2).
+    k, small = 2.0, 1e-6
+    c = k / np.sqrt(2.0)
+    sizes, errors = [], []
+    for cells in (3, 6, 12):
+        vertices, tets = tet_box((cells,) * 3, (1.0,) * 3)
+        vertices = vertices.astype(np.float32).astype(np.float64)
+        wave, (sy, sz) = np.exp(k * vertices[:, 0]), np.sin(c * vertices[:, 1:]).T
+        cy, cz = np.cos(c * vertices[:, 1:]).T
+        exact = small * wave[:, None] * np.stack([k * sy * sz, c * cy * sz, c * sy * cz], axis=1)
+        edge = np.any((vertices < 1e-6) | (vertices > 1.0 - 1e-6), axis=1)
+        model = make_model(
+            vertices,
+            tets,
+            pinned=edge,
+            gravity=(0, 0, 0),
+            integrator="quasi-static",
+            newton_tolerance=1e-13,
+            cg_tolerance=1e-8,
+        )
+        begun = vertices + np.where(edge[:, None], exact, 0.0)
+        found = settled(model, begun) - vertices
+        sizes.append(1.0 / cells)
+        errors.append(float(np.sqrt(np.mean((found - exact)[~edge] ** 2) / np.mean(exact**2))))
+    yield at_most("relative error inside, 12^3 cells", 1e-2, errors[-1])
+    yield absolute("order, 3^3 to 12^3 cells", 2.0, order(sizes, errors), 0.25)
+
+
+PROBLEMS = (patch, uniaxial, shear, cantilever, cantilever_tip, elastica, torsion, static_dt, order_h)
+
+__all__ = ["PROBLEMS"]
