@@ -265,25 +265,20 @@ _CG_SERIAL = f"""
         if (averaged) {{
             // q += G^T D G p
             for (int i = 0; i < rows; ++i) {{
-                double total = 0.0;
-                for (int k = offsets.data[i]; k < offsets.data[i + 1]; ++k) {{
-                    const double* const g = forward_ + 3 * (size_t)k;
-                    const double* const v = p + 4 * (size_t)columns.data[k];
-                    total += g[0] * v[0] + g[1] * v[1] + g[2] * v[2];
-                }}
-                change[i] = curvature.data[i] * total;
+                D total = (D)0.0;
+                const int end = offsets.data[i + 1];
+                for (int k = offsets.data[i]; k < end; ++k)
+                    total += load(forward_ + 3 * (size_t)k) * load(p + 4 * (size_t)columns.data[k]);
+                change[i] = curvature.data[i] * ((total[0] + total[1]) + total[2]);
             }}
             pq = 0.0;
             for (int i = 0; i < rows; ++i) {{
                 const size_t at = 4 * (size_t)i;
                 D t = load(q + at);
-                for (int k = offsets.data[i]; k < offsets.data[i + 1]; ++k) {{
-                    const double* const g = transposed_ + 3 * (size_t)k;
-                    const double c = change[columns.data[k]];
-                    t[0] += c * g[0];
-                    t[1] += c * g[1];
-                    t[2] += c * g[2];
-                }}
+                const int end = offsets.data[i + 1];
+                for (int k = offsets.data[i]; k < end; ++k)
+                    t += change[columns.data[k]] * load(transposed_ + 3 * (size_t)k);
+                t[3] = 0.0;
                 store(q + at, t);
                 pq += dot(load(p + at), t);
             }}

@@ -93,7 +93,8 @@ class ConjugateGradient:
     def average(self, forward: wp.array, transposed: wp.array, curvature: wp.array) -> None:
         """Add G^T D G to A, factor by factor, for good; the arrays are read anew in every solve.
 
-        forward, transposed: [N] vec3d, G (row by row) and its transpose, in the order of `Topology.columns`
+        forward, transposed: [N + 1] vec3d, G (row by row) and its transpose, in the order of
+                             `Topology.columns`; the last is not used, but read
         curvature:           [P] D
         """
         self._forward, self._transposed, self._curvature = forward, transposed, curvature
@@ -105,9 +106,9 @@ class ConjugateGradient:
         if len(self._change):
             offsets, columns = self.offsets.numpy(), self.columns.numpy()
             rows = np.repeat(np.arange(self.rows), np.diff(offsets))
-            change = np.bincount(rows, (self._forward.numpy() * x[columns]).sum(1), self.rows)
+            change = np.bincount(rows, (self._forward.numpy()[:-1] * x[columns]).sum(1), self.rows)
             change *= self._curvature.numpy()
-            back = self._transposed.numpy() * change[columns, None]
+            back = self._transposed.numpy()[:-1] * change[columns, None]
             found += np.stack([np.bincount(rows, back[:, k], self.rows) for k in range(3)], 1)
         return found
 

@@ -42,7 +42,7 @@ def kept_lambda(model: Model, rest: RestShapes) -> np.ndarray:
 class NodalPressure:
     """Energy and derivatives of `gdpro_sim.kernels.nodal_pressure`; allocates everything once.
 
-    forward, transposed: [N] vec3d, G and its transpose on the pattern of the tangent matrix, m^2
+    forward, transposed: [N + 1] vec3d, G and its transpose on the pattern of the tangent matrix, m^2
     curvature:           [P] D, Pa/m^3
     blocks:              [P] mat33d diagonal blocks of G^T D G, for the preconditioner
     """
@@ -86,7 +86,9 @@ class NodalPressure:
         self._pressure, self.curvature = (wp.zeros(count, dtype=wp.float64, device=device) for _ in range(2))
         self._slopes = wp.zeros(4 * self.element_count, dtype=wp.vec3d, device=device)
         self.forward, self.transposed = (
-            wp.zeros(len(topology.columns), dtype=wp.vec3d, device=device) for _ in range(2)
+            # One more, because entries are read four numbers at a time.
+            wp.zeros(len(topology.columns) + 1, dtype=wp.vec3d, device=device)
+            for _ in range(2)
         )
         self.blocks = wp.zeros(count, dtype=wp.mat33d, device=device)
 
