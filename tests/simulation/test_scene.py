@@ -5,11 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.generation import objects
 from gdpro_sim.materials import PRESETS, Material
-from gdpro_sim.simulation.scene import Scene, check_scene, load_scene, scene_names
+from gdpro_sim.simulation.forces import (
+    AirFlow,
+    Attachment,
+    ConstantForce,
+    Keyframe,
+    Pin,
+    Push,
+    Spring,
+    SpringEnd,
+    SurfacePressure,
+)
+from gdpro_sim.simulation.scene import Scene, SceneBody, check_scene, load_scene, scene_names
 
 MINIMAL = "bodies:\n  - asset: thing.obj\n"
 
@@ -69,6 +81,71 @@ def test_defaults_and_relative_paths(tmp_path: Path) -> None:
         (MINIMAL + "solver: {kind: mpm}", "solver.kind: must be 'fem'"),
         (MINIMAL + "duration: 0", "duration: must be greater than 0"),
         (MINIMAL + "folder: /", "unknown key `folder`"),
+        (MINIMAL + "fps: 0", "fps: must be greater than or equal to 1, got 0"),
+        (MINIMAL + "    material: {preset: jelly, density: 0}", "density: must be greater than 0, got 0"),
+        (
+            MINIMAL + "    pins: {}",
+            r"pins\[0\]: give a box \(minimum, maximum\), a sphere .* or vertices to pin",
+        ),
+        (MINIMAL + "    pins: {side: up}", r"pins\[0\].side: must be 'bottom', 'top', .*, got 'up'"),
+        (MINIMAL + "    pins: {sid: top}", r"pins\[0\].sid: unknown key \(did you mean `side`\?\)"),
+        (
+            MINIMAL + "    pins: {side: top, radius: 1, center: [0, 0, 0]}",
+            "give one of box, sphere, side and v",
+        ),
+        (MINIMAL + "    pins: {radius: 1}", "a sphere needs both `center` and `radius`"),
+        (MINIMAL + "    pins: {fraction: 0.1, vertices: [1]}", "`fraction` belongs to a `side`"),
+        (
+            MINIMAL + "    pins: {vertices: [-1]}",
+            r"vertices\[0\]: must be greater than or equal to 0, got -1",
+        ),
+        (
+            MINIMAL + "    pins: {minimum: [0, 0, 1], maximum: [1, 1, 0]}",
+            r"pins\[0\].maximum: must not lie below minimum \[0.0, 0.0, 1.0\]",
+        ),
+        (MINIMAL + "    pins: {side: top, pivot: [0, 0, 0]}", "`pivot` belongs to a `motion`"),
+        (MINIMAL + "    pins: {side: top, release: 0}", "release: must be greater than 0, got 0"),
+        (
+            MINIMAL + "    pins: {side: top, motion: [{time: 2}, {time: 1}]}",
+            r"motion: keyframes must be in order of time, got 2 s, 1 s",
+        ),
+        (
+            MINIMAL + "    pins: {side: top, motion: {time: 0, translation: [0, 0, 1]}}",
+            "motion: the keyframe at time 0 must have no translation",
+        ),
+        (
+            MINIMAL + "    forces: {force: [0, 0, 1], start: 2, end: 1}",
+            r"end must be after start \(2 s\), got 1 s",
+        ),
+        (MINIMAL + "    impulses: {time: 1}", r"impulses\[0\]: give either `impulse` \(N s\) or `velocity`"),
+        (MINIMAL + "    pressures: {side: top}", r"pressures\[0\].pressure: is required"),
+        (MINIMAL + "wind: {density: 0}", r"wind\[0\].density: must be greater than 0, got 0"),
+        (
+            MINIMAL + "wind: {bodies: [thin]}",
+            r"wind\[0\].bodies: there is no body 'thin' \(did you mean 'thing'\?",
+        ),
+        (
+            MINIMAL + "springs: {ends: [{point: [0, 0, 0]}, {body: rope, vertex: 1}], stiffness: 1}",
+            r"springs\[0\].ends\[1\].body: there is no body 'rope'; bodies: thing",
+        ),
+        (
+            MINIMAL + "springs: {ends: [{point: [0, 0, 0]}, {point: [1, 0, 0]}], stiffness: 1}",
+            r"springs\[0\]: one of the two ends must be on a body",
+        ),
+        (
+            MINIMAL + "springs: {ends: [{point: [0, 0, 0]}, {body: thing}], stiffness: 1}",
+            r"ends\[1\]: give either `point` \(m\) or `vertex`",
+        ),
+        (
+            MINIMAL + "springs: {ends: [{point: [0, 0, 0]}, {vertex: 3}], stiffness: 1}",
+            r"ends\[1\]: `vertex` needs a `body`",
+        ),
+        (MINIMAL + "attachments: {bodies: [thing, thing]}", "an attachment ties two different bodies"),
+        (
+            MINIMAL + "    impulses: {velocity: [0, 0, 1]}\nsolver: {integrator: quasi-static}",
+            r"bodies\[thing\].impulses: have no effect without inertia",
+        ),
+        (MINIMAL + "solver: {contact_gap: 0}", "contact_gap: must be greater than 0"),
     ],
 )
 def test_wrong_scenes_are_refused(tmp_path: Path, text: str, expected: str) -> None:
@@ -77,6 +154,56 @@ def test_wrong_scenes_are_refused(tmp_path: Path, text: str, expected: str) -> N
     assert caught.value.exit_code == 2
     assert str(tmp_path / "scene.yaml") in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_yaml_and_python_say_the_same(tmp_path: Path) -> None:
+    text = """bodies:
+  - asset: thing.obj
+    pins:
+      - side: bottom
+        fraction: 0.1
+      - {center: [0, 0, 1], radius: 0.2, release: 1.5, motion: {time: 1, rotation: [0, 0, 90]}}
+    forces: {force: [0, 0, 10], side: top}
+    impulses: {velocity: [1, 0, 0], time: 0.5}
+    pressures: {pressure: -500}
+  - {asset: thing.obj, name: other}
+wind: {velocity: [5, 0, 0]}
+springs: {ends: [{body: thing, point: [0, 0, 1]}, {body: other, vertex: 3}], stiffness: 100}
+attachments: {bodies: [thing, other]}
+"""
+    body = SceneBody(
+        asset="thing.obj",
+        pins=(
+            Pin(side="bottom", fraction=0.1),
+            Pin(center=(0, 0, 1), radius=0.2, release=1.5, motion=(Keyframe(time=1, rotation=(0, 0, 90)),)),
+        ),
+        forces=(ConstantForce(force=(0, 0, 10), side="top"),),
+        impulses=(Push(velocity=(1, 0, 0), time=0.5),),
+        pressures=(SurfacePressure(pressure=-500),),
+    )
+    scene = Scene(
+        name="scene",
+        bodies=(body, SceneBody(asset="thing.obj", name="other")),
+        wind=(AirFlow(velocity=(5, 0, 0)),),
+        springs=(
+            Spring(
+                ends=(SpringEnd(body="thing", point=(0, 0, 1)), SpringEnd(body="other", vertex=3)),
+                stiffness=100,
+            ),
+        ),
+        attachments=(Attachment(bodies=("thing", "other")),),
+        folder=tmp_path,
+    )
+    assert load_text(tmp_path, text) == scene
+
+
+@pytest.mark.parametrize(
+    "options", [AirFlow, Attachment, ConstantForce, Keyframe, Pin, Push, Spring, SpringEnd, SurfacePressure]
+)
+def test_every_option_is_described(options: type[BaseModel]) -> None:
+    assert options.__doc__
+    for name, field in options.model_fields.items():
+        assert field.description or name == "ends", name
 
 
 def test_every_wrong_value_is_named(tmp_path: Path) -> None:
