@@ -206,8 +206,11 @@ def _check_embedding(asset: str, embedding: Embedding, vertex_count: int, tet_co
 
 
 def _digest(asset: Asset) -> str:
-    """SHA-256 of everything an asset holds, so that a damaged file is noticed."""
-    material = asset.material.model_dump_json() if asset.material is not None else ""
+    """SHA-256 of everything an asset holds, so that a damaged file is noticed.
+
+    Of the material what differs from defaults, so that files from before a field came still fit.
+    """
+    material = "" if asset.material is None else asset.material.model_dump_json(exclude_defaults=True)
     method = asset.tets.method if asset.tets is not None else ""
     result = hashlib.sha256(json.dumps([asset.name, asset.provenance, material, method]).encode())
     arrays = [prims.to_numpy(getattr(asset.gaussians, f.name)) for f in fields(asset.gaussians)]
