@@ -244,15 +244,21 @@ class Launches:
         if count <= 0:
             return
         arguments = [*inputs, *outputs]
-        identity = (count, *(id(a) if _is_held(a) else None for a in arguments))
-        recorded = self._recorded.get((kernel, *identity))
+        key: list[Any] = [kernel, count]
+        numbers = []
+        for argument in arguments:
+            if _is_held(argument):
+                key.append(id(argument))
+            else:
+                key.append(None)
+                numbers.append(argument)
+        recorded = self._recorded.get(tuple(key))
         if recorded is None:
             if len(self._recorded) >= MAX_RECORDED:
                 self._recorded.clear()
             wp.load_module(kernel.module, device=self.device)
-            recorded = self._recorded[(kernel, *identity)] = _Recorded(kernel, arguments, self.device)
-        numbers = [a for a in arguments if not _is_held(a)]
-        if self.device != "cpu":
+            recorded = self._recorded[tuple(key)] = _Recorded(kernel, arguments, self.device)
+        if self.device != "cpu" or count < 2 * minimum or thread_count() == 1:
             recorded.launch(0, count, numbers)
         else:
             run_chunks(lambda begin, end: recorded.launch(begin, end, numbers), count, minimum)
@@ -263,7 +269,9 @@ MAX_RECORDED = 512
 
 
 def _is_held(argument: Any) -> bool:
-    return hasattr(argument, "__ctype__")  # arrays and structs
+    """Whether it is an array or a struct."""
+    kind = argument.__class__
+    return kind is wp.array or (kind is not float and kind is not int and hasattr(argument, "__ctype__"))
 
 
 class _Recorded:

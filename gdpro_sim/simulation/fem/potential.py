@@ -95,6 +95,8 @@ class IncrementalPotential:
         count = t + p + sum(term.energies for term in terms) + (p if self._averaged else 0)
         self._energies = wp.zeros(count, dtype=wp.float64, device=device)
         self._sums, self._maxima = (wp.zeros(RANGES, dtype=wp.float64, device=device) for _ in range(2))
+        # On the CPU these are the arrays' own memory.
+        self._views = [array.numpy() for array in (self._sums, self._maxima)] if device == "cpu" else None
         self._diagonal: wp.array = wp.array(topology.diagonal, dtype=wp.int32, device=device)
         self._pairs: list[wp.array] = [
             wp.array(part, dtype=wp.int32, device=device)
@@ -232,7 +234,7 @@ class IncrementalPotential:
             [self.vertex_count, RANGES, self.system.right_hand_side, self.vertices.mass],
             [self._maxima],
         )
-        return float(np.sqrt(self._maxima.numpy().max()))
+        return float(np.sqrt(self._measured()[1].max()))
 
     def step_measures(self) -> StepMeasures:
         """Slope of E along the system's solution, J, and the largest vertex move in it, m."""
@@ -242,7 +244,8 @@ class IncrementalPotential:
             [self.vertex_count, RANGES, self.system.solution, self.system.right_hand_side],
             [self._sums, self._maxima],
         )
-        return StepMeasures(float(self._sums.numpy().sum()), float(np.sqrt(self._maxima.numpy().max())))
+        sums, maxima = self._measured()
+        return StepMeasures(float(sums.sum()), float(np.sqrt(maxima.max())))
 
     def move_trial(self, length: float) -> None:
         """trial = start + length * (the system's solution)."""
@@ -298,9 +301,13 @@ class IncrementalPotential:
         self.over_elements(elements.element_volume_ratio, [self.elements, x], [self._energies])
         return float(self._energies.numpy()[: self.element_count].min())
 
+    def _measured(self) -> list[np.ndarray]:
+        """Partial sums and maxima of the last measure."""
+        return self._views or [self._sums.numpy(), self._maxima.numpy()]
+
     def _total(self, terms: wp.array) -> float:
         self._launch(linalg.sum_ranges, RANGES, [len(terms), RANGES, terms], [self._sums])
-        return float(self._sums.numpy().sum())
+        return float(self._measured()[0].sum())
 
     def over_vertices(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
         self._launch(kernel, self.vertex_count, inputs, outputs, minimum=4096)

@@ -32,7 +32,7 @@ class RigidModes:
         pieces, labels = connected_components(graph, directed=False)
         held = np.bincount(labels, weights=fixed | (mass <= 0.0), minlength=pieces) > 0
         self._mass = mass
-        self._pieces = [np.flatnonzero(labels == k) for k in np.flatnonzero(~held)]
+        self._pieces = [_as_slice(np.flatnonzero(labels == k)) for k in np.flatnonzero(~held)]
 
     def correct(self, system: ConjugateGradient, x: np.ndarray, negligible: float) -> bool:
         """Add the missing rigid motions to `system.solution`; whether there were any.
@@ -62,18 +62,25 @@ class RigidModes:
             system.solution.assign(solution)
         return True
 
-    def _frame(self, x: np.ndarray, piece: np.ndarray) -> tuple[float, np.ndarray, float]:
+    def _frame(self, x: np.ndarray, piece: np.ndarray | slice) -> tuple[float, np.ndarray, float]:
         """Mass of a piece, its vertices relative to the centre of mass [n, 3], and its radius of gyration."""
         mass = self._mass[piece]
         total = float(mass.sum())
         arms = x[piece] - (mass @ x[piece]) / total
-        return total, arms, max(float(np.sqrt(mass @ (arms * arms).sum(1) / total)), 1e-30)
+        return total, arms, max(float(np.sqrt(np.einsum("i,ij,ij", mass, arms, arms) / total)), 1e-30)
 
     @staticmethod
     def _acceleration(force: np.ndarray, mass: float, arms: np.ndarray, radius: float) -> float:
         """Size of the acceleration that forces [n, 3] would give a rigid piece, spin included, m/s^2."""
-        turn = np.cross(arms, force).sum(0)
-        return float(np.linalg.norm(force.sum(0)) + np.linalg.norm(turn) / radius) / mass
+        products = np.einsum("ni,nj->ij", arms, force)
+        turn = np.linalg.norm(products - products.T) / np.sqrt(2.0)
+        return float(np.linalg.norm(force.sum(0)) + turn / radius) / mass
+
+
+def _as_slice(ids: np.ndarray) -> np.ndarray | slice:
+    """Ascending ids, as a slice where they are consecutive: NumPy then copies nothing."""
+    first, last = int(ids[0]), int(ids[-1])
+    return slice(first, last + 1) if last - first + 1 == len(ids) else ids
 
 
 def rigid_basis(arms: np.ndarray) -> np.ndarray:
