@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from gdpro_sim.simulation.verification import fem_contact, fem_dynamics, fem_robustness, fem_statics
+from gdpro_sim.simulation.verification import (
+    fem_contact,
+    fem_dynamics,
+    fem_materials,
+    fem_robustness,
+    fem_statics,
+)
 
 PROBLEMS = (
+    *fem_materials.PROBLEMS,
     *fem_statics.PROBLEMS,
     *fem_dynamics.PROBLEMS,
     *fem_contact.PROBLEMS,

@@ -1,4 +1,4 @@
-"""FEM where nothing moves: elements, materials, beams."""
+"""FEM where nothing moves: the patch test, beams, order in the mesh size."""
 
 from __future__ import annotations
 
@@ -6,26 +6,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from gdpro_sim.simulation.verification.beams import Beam
 from gdpro_sim.simulation.verification.framework import Check, absolute, at_least, at_most, problem, relative
-from gdpro_sim.simulation.verification.models import make_model, tet_box
+from gdpro_sim.simulation.verification.models import make_model, tet_box, uneven_box
 from gdpro_sim.simulation.verification.probe import TIGHT, Probe, order, settled, start, without_locking
 from gdpro_sim.simulation.verification.reference import ReferenceFem
 
-POISSON = float(np.float32(0.3))
-"""As a model stores it."""
-
 AFFINE = np.array([[1.2, 0.1, 0.0], [0.05, 0.9, -0.1], [0.0, 0.2, 1.1]])
-
-
-def _uneven_box(cells: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, tets and which vertices lie inside; those are moved so that no two elements are alike."""
-    vertices, tets = tet_box((cells,) * 3, (size,) * 3)
-    inside = np.all((vertices > 1e-9) & (vertices < size - 1e-9), axis=1)
-    vertices[inside] += 0.04 * size / cells * np.random.default_rng(0).normal(size=(int(inside.sum()), 3))
-    return vertices.astype(np.float32).astype(np.float64), tets, inside
 
 
 @problem(
@@ -34,7 +22,7 @@ def _uneven_box(cells: int, size: float) -> tuple[np.ndarray, np.ndarray, np.nda
     source="Irons & Razzaque 1972: x = A X at the boundary gives F = A everywhere, no force inside",
 )
 def patch() -> Iterator[Check]:
-    vertices, tets, inside = _uneven_box(3, 0.5)
+    vertices, tets, inside = uneven_box(3, 0.5)
     model = make_model(
         vertices, tets, young=1e5, pinned=~inside, gravity=(0, 0, 0), integrator="quasi-static", **TIGHT
     )
@@ -47,54 +35,6 @@ def patch() -> Iterator[Check]:
     disturbed[inside] += 0.01 * np.random.default_rng(1).normal(size=(int(inside.sum()), 3))
     found = settled(model, disturbed)
     yield at_most("solved from a disturbed start: off by", 1e-9, np.abs(found - exact).max(), "m")
-
-
-@problem(
-    "uniaxial",
-    title="A bar stretched freely: lateral stretch and nominal stress, stable neo-Hookean",
-    source="Smith et al. 2018, eq. 13: mu s + (L (l s^2 - 1) - mu) l s = 0, L = lambda + mu; PHYSICS.md",
-)
-def uniaxial() -> Iterator[Check]:
-    young = 1e5
-    vertices, tets = tet_box((2, 2, 2), (1.0, 1.0, 1.0))
-    probe = Probe(make_model(vertices, tets, young=young))
-    lam, mu = young * POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), young / (2 * (1 + POISSON))
-    right, back = vertices[:, 0] == 1.0, vertices[:, 1] == 1.0
-
-    for stretch in (0.7, 0.9, 1.1, 1.5, 2.0):
-
-        def face_forces(s: float, stretch: float = stretch) -> tuple[float, float]:
-            forces = probe.forces(vertices * [stretch, s, s])
-            return float(forces[right, 0].sum()), float(forces[back, 1].sum())
-
-        # (lam + mu) l^2 s^3 - (lam + 2 mu) l s + mu s = 0, s > 0
-        lateral = np.sqrt(((lam + 2 * mu) * stretch - mu) / (lam + mu)) / stretch
-        stress = mu * stretch + ((lam + mu) * (stretch * lateral**2 - 1.0) - mu) * lateral**2
-        found = brentq(lambda s: face_forces(s)[1], 0.5, 1.5, xtol=1e-14)
-        yield absolute(f"lateral stretch at {stretch:g}", lateral, found, 1e-9)
-        yield absolute(f"P11 / E at {stretch:g}", stress / young, face_forces(found)[0] / young, 1e-9)
-
-
-@problem(
-    "shear",
-    title="Simple shear: stresses from reactions of a solved block, stable neo-Hookean",
-    source="J = 1: P = mu (F - F^-T), so that P12 = P21 = mu gamma and P11 = P22 = 0",
-)
-def shear() -> Iterator[Check]:
-    young = 1e5
-    mu = young / (2 * (1 + POISSON))
-    vertices, tets, inside = _uneven_box(3, 1.0)
-    model = make_model(
-        vertices, tets, young=young, pinned=~inside, gravity=(0, 0, 0), integrator="quasi-static", **TIGHT
-    )
-    probe = Probe(model)
-    for gamma in (0.1, 0.5, 1.0):
-        x = vertices @ np.array([[1.0, gamma, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).T
-        forces = probe.forces(settled(model, x))
-        stress = forces.T @ vertices  # the virial: the integral of P over the block of 1 m^3
-        yield relative(f"P12 / mu at {gamma:g}", gamma, stress[0, 1] / mu, 1e-8)
-        yield relative(f"P21 / mu at {gamma:g}", gamma, stress[1, 0] / mu, 1e-8)
-        yield absolute(f"P22 / mu at {gamma:g}", 0.0, stress[1, 1] / mu, 1e-8)
 
 
 def _cantilever(beam: Beam, cells: int, *, tip_load: float = 0.0) -> dict[str, np.ndarray]:
@@ -148,22 +88,41 @@ SLENDER = Beam(length=1.0, side=0.1, young=2e6, poisson=0.3, density=1000.0)
 """Sags by half of its length."""
 
 
+def _extrapolated(cells: list[int], bound: float, *, tip_load: float = 0.0) -> Iterator[Check]:
+    """Sag of the stubby beam on ever finer meshes: it grows, and its limit is that of beam theory."""
+    ratios = []
+    for across in cells:
+        mesh = _cantilever(STUBBY, across, tip_load=tip_load)
+        theory = STUBBY.sag()
+        if tip_load > 0.0:
+            theory = STUBBY.tip_deflection(tip_load, STUBBY.length - 0.5 * STUBBY.side / across)
+        ratios.append(_drop(STUBBY, mesh)[1] / theory)
+    for across, ratio in zip(cells, ratios, strict=True):
+        yield at_most(f"sag / theory, {across} cells across", 1.0, ratio)
+    yield at_least("least growth of that from mesh to mesh", 0.0, np.diff(ratios).min())
+    yield relative("sag / theory, locking extrapolated away", 1.0, without_locking(cells, ratios), bound)
+
+
 @problem(
     "cantilever",
     title="A cantilever of 1 x 0.2 x 0.2 m, E = 1e7 Pa, sags a little under its own weight",
     source="Timoshenko: w L^4 / 8 EI + w L^2 / 2 kappa G A; float64 reference with a direct solver",
 )
 def cantilever() -> Iterator[Check]:
-    sags, cells = [], [4, 6, 8]
-    for across in cells:
-        mesh = _cantilever(STUBBY, across)
-        sags.append(_drop(STUBBY, mesh)[1])
-        if across == 4:
-            quantity = f"tip sag, {len(mesh['tets'])} tets, reference on the same mesh"
-            yield relative(quantity, _reference_drop(STUBBY, mesh)[1], sags[-1], 0.01, "m")
-    yield at_least("sag of 8 cells across less that of 6: locking eases", 0.0, sags[2] - sags[1], "m")
-    quantity = "tip sag, 4, 6 and 8 cells across, locking extrapolated away"
-    yield relative(quantity, STUBBY.sag(), without_locking(cells, sags), 0.03, "m")
+    mesh = _cantilever(STUBBY, 3)
+    quantity = f"tip sag, {len(mesh['tets'])} tets, reference on the same mesh"
+    yield relative(quantity, _reference_drop(STUBBY, mesh)[1], _drop(STUBBY, mesh)[1], 0.01, "m")
+    yield from _extrapolated([3, 4, 6], 0.05)
+
+
+@problem(
+    "cantilever-fine",
+    title="The same on finer meshes",
+    source="Timoshenko, as above; the clamp holds the section's width too, which stiffens it a little",
+    slow=True,
+)
+def cantilever_fine() -> Iterator[Check]:
+    yield from _extrapolated([4, 6, 8], 0.03)
 
 
 @problem(
@@ -172,18 +131,10 @@ def cantilever() -> Iterator[Check]:
     source="Timoshenko: F a^2 (3 L - a) / 6 EI + F a / kappa G A, a the middle of the last cells",
 )
 def cantilever_tip() -> Iterator[Check]:
-    sags, expected, cells = [], [], [4, 6, 8]
-    for across in cells:
-        mesh = _cantilever(STUBBY, across, tip_load=100.0)
-        sags.append(_drop(STUBBY, mesh)[1])
-        at = STUBBY.length - 0.5 * STUBBY.side / across
-        expected.append(STUBBY.tip_deflection(100.0, at))
-        if across == 4:
-            quantity = f"tip deflection, {len(mesh['tets'])} tets, reference on the same mesh"
-            yield relative(quantity, _reference_drop(STUBBY, mesh)[1], sags[-1], 0.01, "m")
-    ratios = [sag / theory for sag, theory in zip(sags, expected, strict=True)]
-    quantity = "deflection / theory, 4, 6 and 8 cells across, locking extrapolated away"
-    yield relative(quantity, 1.0, without_locking(cells, ratios), 0.03)
+    mesh = _cantilever(STUBBY, 3, tip_load=100.0)
+    quantity = f"tip deflection, {len(mesh['tets'])} tets, reference on the same mesh"
+    yield relative(quantity, _reference_drop(STUBBY, mesh)[1], _drop(STUBBY, mesh)[1], 0.01, "m")
+    yield from _extrapolated([3, 4, 6], 0.05, tip_load=100.0)
 
 
 @problem(
@@ -257,7 +208,7 @@ def static_dt() -> Iterator[Check]:
     options: dict[str, Any] = {
         "young": 1e6,
         "pinned": mesh["pinned"],
-        "rayleigh_mass": 20.0,
+        "rayleigh_mass": 15.0,
         "substeps": 1,
         "newton_tolerance": 1e-8,
         "cg_tolerance": 1e-6,
@@ -265,7 +216,7 @@ def static_dt() -> Iterator[Check]:
     vertices, tets = mesh["vertices"], mesh["tets"]
     rest = settled(make_model(vertices, tets, **{**options, "integrator": "quasi-static"}))
     yield at_least("sag of the tip", 0.1, (vertices - rest)[mesh["tip"], 2].mean(), "m")
-    for dt, steps in ((1 / 60, 150), (1 / 24, 80), (0.2, 40), (2.0, 15)):
+    for dt, steps in ((1 / 60, 240), (1 / 24, 80), (0.2, 40), (2.0, 15)):
         solver = start(make_model(vertices, tets, **options))
         for _ in range(steps):
             solver.step(dt)
@@ -312,6 +263,6 @@ def order_h() -> Iterator[Check]:
     yield absolute("order, 3^3 to 12^3 cells", 2.0, order(sizes, errors), 0.25)
 
 
-PROBLEMS = (patch, uniaxial, shear, cantilever, cantilever_tip, elastica, torsion, static_dt, order_h)
+PROBLEMS = (patch, cantilever, cantilever_fine, cantilever_tip, elastica, torsion, static_dt, order_h)
 
 __all__ = ["PROBLEMS"]

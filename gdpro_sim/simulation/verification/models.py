@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gdpro_sim.materials import LAWS
 from gdpro_sim.simulation.model import FemSettings, Ground, Model
 
 
@@ -36,6 +37,17 @@ def tet_grid(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, n
             corners[2], corners[3] = corners[3], corners[2]
         tets.append(np.stack(corners, axis=1))
     return vertices, np.concatenate(tets).astype(np.int32)
+
+
+def uneven_box(cells: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A cube, see `tet_box`: vertices, tets, and which vertices lie inside [P] bool.
+
+    Those are moved, so that no two elements are alike; vertices are exact in float32.
+    """
+    vertices, tets = tet_box((cells,) * 3, (size,) * 3)
+    inside = np.all((vertices > 1e-9) & (vertices < size - 1e-9), axis=1)
+    vertices[inside] += 0.04 * size / cells * np.random.default_rng(0).normal(size=(int(inside.sum()), 3))
+    return vertices.astype(np.float32).astype(np.float64), tets, inside
 
 
 def tet_ball(cells: int, radius: float, grading: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -68,12 +80,16 @@ def make_model(
     pinned: np.ndarray | None = None,
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
     ground: Ground | None = None,
+    law: str | None = None,
+    yield_stress: float | None = None,
+    hardening: float = 0.0,
     device: str = "cpu",
     **settings: Any,
 ) -> Model:
     """A model of one uniform material without bodies (they only matter to the surface).
 
-    density: kg/m^3, one for all elements or [T]; `settings` are those of `FemSettings`
+    density: kg/m^3, one for all elements or [T]; law: a name of `gdpro_sim.materials.LAWS`; `settings` are
+    those of `FemSettings`
     """
     count, elements = len(vertices), len(tets)
 
@@ -98,7 +114,10 @@ def make_model(
         ground=ground,
         fem=FemSettings(**settings),
         device=device,
+        law=None if law is None else np.full(elements, LAWS.index(law), np.int32),
+        yield_stress=None if yield_stress is None else each(yield_stress, elements),
+        hardening=None if yield_stress is None else each(hardening, elements),
     )
 
 
-__all__ = ["make_model", "tet_ball", "tet_box", "tet_grid"]
+__all__ = ["make_model", "tet_ball", "tet_box", "tet_grid", "uneven_box"]
