@@ -11,7 +11,7 @@ import warp as wp
 from scipy.optimize import brentq
 
 from gdpro_sim.errors import SolverError
-from gdpro_sim.materials import LAWS, Material
+from gdpro_sim.materials import LAWS, PRESETS, Material
 from gdpro_sim.simulation.conditions import Force
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.fem.rest import rest_shapes
@@ -287,3 +287,12 @@ def test_material_with_a_yield_stress_takes_hencky_s_law() -> None:
     for bad in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(ValueError):
             Material.model_validate({**plastic, "yield_stress": bad})
+
+
+@pytest.mark.parametrize("name", [name for name, values in PRESETS.items() if "yield_stress" in values])
+def test_presets_that_yield_do_so_at_small_strain(name: str) -> None:
+    material = Material.model_validate(name)
+    assert material.model == "stvk_hencky" and material.yield_stress is not None
+    assert 1e-4 < material.yield_stress / material.young < 0.1
+    assert material.hardening < 0.1 * material.young
+    assert Material.model_validate({"preset": name, "yield_stress": None}).yield_stress is None
