@@ -11,13 +11,13 @@ import warp as wp
 
 from gdpro_sim.kernels import elements
 from gdpro_sim.materials import LAWS
-from tests.reference import elasticity as reference
+from gdpro_sim.simulation.verification.closed_forms import lame
 from tests.simulation.fem_models import make_model, potential_at
 
 TET = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.05], [0.0, 0.25, 0.0], [0.05, 0.1, 0.2]], dtype=np.float32)
 # Exact in float32, which is what a model stores.
 YOUNG, POISSON, DAMPING = 1e5, 0.375, 0.0078125
-LAM, MU = reference.lame(YOUNG, POISSON)
+LAM, MU = lame(YOUNG, POISSON)
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
