@@ -161,6 +161,10 @@ class SolverOptions(Options):
     contact_stiffness: float = Field(
         default=1.0, gt=0.0, description="multiple of the automatic ground stiffness"
     )
+    volumes: Literal["auto", "nodal", "element"] = Field(
+        default="auto",
+        description="volume changes averaged around vertices (nodal), per element, or by Poisson's ratio (auto)",
+    )
     contact_gap: float = Field(
         default=FemSettings.contact_gap,
         gt=0.0,
