@@ -292,7 +292,13 @@ def drop_scene(asset: str | Path) -> Scene:
     }
     description = "An asset falls on the floor."
     if loaded.material is not None and loaded.material.young > STIFFEST:
-        body["material"] = {**loaded.material.model_dump(), "young": STIFFEST}
+        body["material"] = {
+            **loaded.material.model_dump(),
+            "young": STIFFEST,
+            "model": "stable_neo_hookean",
+            "yield_stress": None,  # it would mean nothing beside that stiffness
+            "hardening": 0.0,
+        }
         description += f" Young's modulus {loaded.material.young:g} Pa is taken as {STIFFEST:g} Pa."
         log.warning("%s: %s", path.name, description.split(". ")[1])
     data = {

@@ -206,6 +206,34 @@ def test_attachments_start_at_rest(ball: Asset) -> None:
         two_balls(ball, gap=0.5, attachments={"bodies": ["upper", "lower"]})
 
 
+def test_attached_bodies_hang_together(ball: Asset) -> None:
+    """The ties give by weight / stiffness."""
+    bodies = [
+        {"name": "lower", "asset": "ball.usdc", "position": [0, 0, 0.1], "material": "rubber"},
+        {
+            "name": "upper",
+            "asset": "ball.usdc",
+            "position": [0, 0, 0.302],
+            "material": "rubber",
+            "pins": {"side": "top"},
+        },
+    ]
+    ties = {"bodies": ["upper", "lower"], "distance": 0.02, "stiffness": 5000}
+    solver = {"integrator": "quasi-static", "body_contact": False}
+    scene = check_scene({"bodies": bodies, "attachments": ties, "ground": None, "solver": solver})
+    model = compile_scene(scene, {"lower": ball, "upper": ball})
+    fem = SolverFEM(model)
+    fem.step(0.1)
+    assert fem.diagnostics().converged
+    found = model.springs
+    assert found is not None
+    opening = np.einsum("sea,seai->sei", found.weights, fem.positions[found.corners])
+    assert ball.tets is not None
+    weight = 9.81 * 1100.0 * float((ball.tets.volumes() * ball.tets.fill).sum())
+    gap = (opening[:, 0] - opening[:, 1]).mean(0)
+    np.testing.assert_allclose(gap, [0, 0, weight / 5000.0], atol=1e-3 * weight / 5000.0)
+
+
 def test_wind_blows_on_the_named_bodies(ball: Asset) -> None:
     model = two_balls(ball, wind=[{"velocity": [1, 0, 0]}, {"bodies": ["upper"], "start": 1, "end": 2}])
     both, upper = model.loads

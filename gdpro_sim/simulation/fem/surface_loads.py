@@ -73,6 +73,8 @@ class PressureLoad(ForceTerm):
         if not self._load.closed:
             self.launch(kernels.add_loads, self.count, [self.vertices, self._force], [gradient])
             return None
+        if self._pressure == 0.0:
+            return None
         e = self._edges
         inputs = [e.offsets, e.opposite, e.signs, self._pressure, x]
         self.launch(kernels.edge_blocks, e.count, inputs, [e.across, e.along])
