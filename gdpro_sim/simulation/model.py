@@ -9,6 +9,7 @@ import numpy as np
 
 from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.meshing.tetmesh import Embedding
+from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.conditions import Load, Motion, Springs
 
 
@@ -121,6 +122,7 @@ class Model:
     motions: tuple[Motion, ...] = ()
     springs: Springs | None = None
     loads: tuple[Load, ...] = ()
+    colliders: tuple[Collider, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import warp as wp
 
 from gdpro_sim import device as devices
 from gdpro_sim.errors import SolverError
-from gdpro_sim.kernels import contact, elasticity, fem, linalg
+from gdpro_sim.kernels import colliders, elasticity, fem, linalg
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.fem.conjugate_gradient import ConjugateGradient
 from gdpro_sim.simulation.model import Ground, Model
@@ -159,7 +159,7 @@ def test_steps_allocate_no_device_arrays(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_no_module_builds_backward_kernels() -> None:
-    for module in (linalg, elasticity, contact, fem):
+    for module in (linalg, elasticity, colliders, fem):
         assert wp.get_module_options(module)["enable_backward"] is False
 
 

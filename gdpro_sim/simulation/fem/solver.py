@@ -12,9 +12,9 @@ import warp as wp
 
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import fem
+from gdpro_sim.simulation.fem.colliders import collider_contacts
 from gdpro_sim.simulation.fem.contact import body_contact
 from gdpro_sim.simulation.fem.forces import force_terms
-from gdpro_sim.simulation.fem.ground import GroundContact
 from gdpro_sim.simulation.fem.integrators import ImplicitStep, State
 from gdpro_sim.simulation.fem.potential import IncrementalPotential
 from gdpro_sim.simulation.fem.rest import rest_shapes
@@ -80,8 +80,11 @@ class SolverFEM:
     def __init__(self, model: Model) -> None:
         self.model = model
         rest = rest_shapes(model)
-        floor: tuple[Term, ...] = () if model.ground is None else (GroundContact(model, rest),)
-        self.terms: tuple[Term, ...] = (*force_terms(model, rest), *floor, *body_contact(model, rest))
+        self.terms: tuple[Term, ...] = (
+            *force_terms(model, rest),
+            *collider_contacts(model, rest),
+            *body_contact(model, rest),
+        )
         self._potential = IncrementalPotential(model, rest, self.terms)
         self._rigid_fixed = self._potential.fixed
         self._rigid = RigidModes(model.tets, self._potential.mass, self._rigid_fixed)
