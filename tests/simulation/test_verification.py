@@ -8,10 +8,14 @@ import subprocess
 import sys
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
+import typer
 
+from gdpro_sim.cli.verify import fem
 from gdpro_sim.errors import RequestError, SolverError
 from gdpro_sim.simulation.verification import SOLVERS, problems
+from gdpro_sim.simulation.verification import fem as suite
 from gdpro_sim.simulation.verification.beams import Beam
 from gdpro_sim.simulation.verification.framework import (
     Check,
@@ -24,6 +28,8 @@ from gdpro_sim.simulation.verification.framework import (
     run_problem,
     select,
 )
+from gdpro_sim.simulation.verification.models import tet_ball, uneven_box
+from gdpro_sim.simulation.verification.reference import ReferenceFem
 
 ALL = [item for solver in SOLVERS for item in problems(solver)]
 
@@ -106,42 +112,39 @@ def test_beam_theory() -> None:
     assert stiff.elastica()[1] == pytest.approx(stiff.sag(), rel=3e-3)
 
 
-def gdpro(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "gdpro_sim.cli", "verify", "fem", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
-
-
 def test_the_command_prints_figures_and_passes() -> None:
-    done = gdpro("--only", "uniaxial", "--only", "shear")
-    assert done.returncode == 0, done.stderr
-    for word in (
+    command = [
+        sys.executable,
+        "-m",
+        "gdpro_sim.cli",
+        "verify",
+        "fem",
+        "--only",
         "uniaxial",
-        "Smith et al. 2018",
-        "expected",
-        "measured",
-        "P11 / E at 0.7",
-        "-0.381139",
-        "all pass",
-    ):
+        "--only",
+        "shear",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    for word in ("uniaxial", "Smith et al. 2018", "expected", "P11 / E at 0.7", "-0.381139", "all pass"):
         assert word in done.stdout, word
 
 
-def test_the_command_lists_and_speaks_json() -> None:
-    listed = gdpro("--list")
-    assert listed.returncode == 0 and "elastica" in listed.stdout and "long-run" in listed.stdout
-    assert "long-run" not in gdpro("--list", "--quick").stdout
-    done = gdpro("--only", "patch", "--json")
-    summary = json.loads(done.stdout)
-    assert done.returncode == 0 and summary["passed"] and list(summary["problems"]) == ["patch"]
+def test_the_command_lists_and_speaks_json(capsys: pytest.CaptureFixture[str]) -> None:
+    fem(listing=True)
+    listed = capsys.readouterr().out
+    assert "elastica" in listed and "long-run" in listed
+    fem(listing=True, quick=True)
+    assert "long-run" not in capsys.readouterr().out
+    fem(only=["patch"], json_output=True)
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["passed"] and list(summary["problems"]) == ["patch"]
     assert {"quantity", "expected", "measured", "error", "bound", "passed"} <= set(summary["checks"][0])
 
 
-def test_the_command_fails_where_a_problem_fails(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    import typer
-
-    from gdpro_sim.cli.verify import fem
-    from gdpro_sim.simulation.verification import fem as suite
-
+def test_the_command_fails_where_a_problem_fails(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     wrong = Problem("wrong", "One is two", "nowhere", lambda: [relative("one", 2.0, 1.0, 0.1)])
     monkeypatch.setattr(suite, "PROBLEMS", (wrong,))
     with pytest.raises(typer.Exit) as left:
@@ -152,5 +155,30 @@ def test_the_command_fails_where_a_problem_fails(monkeypatch: pytest.MonkeyPatch
 
 
 def test_an_unknown_problem_is_refused() -> None:
-    done = gdpro("--only", "nonsense")
-    assert done.returncode == 2 and "no problem is called 'nonsense'" in done.stderr
+    with pytest.raises(RequestError, match="no problem is called 'nonsense'"):
+        fem(only=["nonsense"])
+
+
+def test_the_reference_agrees_with_its_own_derivatives() -> None:
+    """Gradient and Hessian of the oracle against finite differences of its energy and gradient."""
+    vertices, tets, _ = uneven_box(2, 0.4)
+    oracle = ReferenceFem(vertices, tets, 1e5, 0.3, 1000.0, np.zeros(len(vertices), bool))
+    rng = np.random.default_rng(0)
+    x = vertices + 0.01 * rng.normal(size=vertices.shape)
+    d = rng.normal(size=vertices.shape)
+    step = 1e-6
+    slope = (oracle.elastic_energy(x + step * d) - oracle.elastic_energy(x - step * d)) / (2 * step)
+    assert slope == pytest.approx(float((oracle.elastic_gradient(x) * d).sum()), rel=1e-6)
+    change = (oracle.elastic_gradient(x + step * d) - oracle.elastic_gradient(x - step * d)) / (2 * step)
+    product = oracle.elastic_hessian(x, projected=False) @ d.reshape(-1)
+    assert np.abs(change.reshape(-1) - product).max() <= 1e-6 * np.abs(product).max()
+
+
+def test_the_ball_is_a_ball() -> None:
+    for cells, grading in ((6, 0.0), (10, 2.5)):
+        vertices, tets = tet_ball(cells, 2.0, grading)
+        corners = vertices[tets]
+        volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+        assert volumes.min() > 0.0
+        assert volumes.sum() == pytest.approx(4.0 / 3.0 * np.pi * 8.0, rel=0.1)
+        assert np.linalg.norm(vertices, axis=1).max() == pytest.approx(2.0)

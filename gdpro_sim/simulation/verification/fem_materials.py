@@ -125,7 +125,7 @@ def locking() -> Iterator[Check]:
     theory = Beam(1.0, 0.2, 1e7, 0.499, 1000.0).sag() / Beam(1.0, 0.2, 1e7, 0.3, 1000.0).sag()
     compressible, own = sag(0.3, "auto"), sag(0.499, "element")
     quantity = f"sag at 0.499 / at 0.3, {len(tets)} tets, averaged volumes"
-    yield relative(quantity, theory, sag(0.499, "auto") / compressible, 0.1)
+    yield relative(quantity, theory, sag(0.499, "auto") / compressible, 0.15)
     yield at_least("what averaging is for: ratio without it falls short by", 0.3, theory - own / compressible)
 
 
