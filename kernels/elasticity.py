@@ -206,8 +206,14 @@ def hencky_hessian(s: wp.vec3d, m: Constants):
 
 
 @wp.func
-def energy_density(F: wp.mat33d, m: Constants) -> wp.float64:
-    """Psi(F), J/m^3; infinite where det F <= 0, but for LINEAR."""
+def needs_stretches(law: int) -> bool:
+    """Whether the energy is a function of the singular values of F."""
+    return law == STVK_HENCKY or law == COROTATED
+
+
+@wp.func
+def energy_density(F: wp.mat33d, s: wp.vec3d, m: Constants) -> wp.float64:
+    """Psi(F), J/m^3; infinite where det F <= 0, but for LINEAR. s are the singular values of F if needed."""
     if m.law == LINEAR:
         e = wp.float64(0.5) * (F + wp.transpose(F)) - wp.identity(n=3, dtype=wp.float64)
         trace = wp.trace(e)
@@ -215,10 +221,9 @@ def energy_density(F: wp.mat33d, m: Constants) -> wp.float64:
     J = wp.determinant(F)
     if J <= wp.float64(0.0):
         return wp.float64(wp.inf)
-    if m.law == STVK_HENCKY or m.law == COROTATED:
-        _U, s, _V = singular_value_decomposition(F)
-        if m.law == STVK_HENCKY:
-            return hencky_energy(s, m)
+    if m.law == STVK_HENCKY:
+        return hencky_energy(s, m)
+    if m.law == COROTATED:
         d = s - wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
         return m.mu * wp.dot(d, d) + volumetric_energy(J, m)
     shear = wp.float64(0.5) * m.mu * (wp.ddot(F, F) - wp.float64(3.0))
@@ -249,7 +254,7 @@ def piola_stress(F: wp.mat33d, m: Constants) -> wp.mat33d:
     U = wp.identity(n=3, dtype=wp.float64)
     V = wp.identity(n=3, dtype=wp.float64)
     s = wp.vec3d()
-    if m.law == COROTATED or m.law == STVK_HENCKY:
+    if needs_stretches(m.law):
         U, s, V = singular_value_decomposition(F)
     return piola_stress_in_frame(F, U, s, V, m)
 

@@ -13,12 +13,12 @@ import warp as wp
 
 from gdpro_sim.kernels.decomposition import singular_value_decomposition
 from gdpro_sim.kernels.elasticity import (
-    COROTATED,
     LINEAR,
     STVK_HENCKY,
     Constants,
     energy_density,
     green_strain_increment,
+    needs_stretches,
     piola_stress,
     piola_stress_in_frame,
     principal_hessian,
@@ -125,26 +125,42 @@ def element_volume_ratio(
 def element_energy(
     start: int,
     # In:
+    lanes: int,
+    count: int,
     elements: Elements,
     x: wp.array[wp.vec3d],
     cauchy_green: wp.array[wp.mat33d],
     inverse_dt: wp.float64,
+    # Work:
+    work_out: wp.array[wp.float64],
     # Out:
     energy_out: wp.array[wp.float64],
 ):
     """Elastic energy plus damping potential of each element, J. inverse_dt = 0 leaves the damping out.
 
-    Where an element yields, what the flow dissipates is in it too.
+    Where an element yields, what the flow dissipates is in it too. The index is a group, as in
+    `element_derivatives`.
     """
-    e = start + wp.tid()
-    F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
-    m = constants_of(elements, e)
-    density = energy_density(F, m)
-    rate = elements.damping[e] * inverse_dt
-    if rate > wp.float64(0.0):
-        strain = green_strain_increment(F, cauchy_green[e])
-        density += viscous_energy(strain, rate * m.mu, rate * m.lam)
-    energy_out[e] = elements.volume[e] * density
+    group = start + wp.tid()
+    place = wp.where(lanes == 1, group, start)
+    end = wp.min(count, (group + 1) * lanes)
+    stretched = bool(False)
+    for e in range(group * lanes, end):
+        stretched = stretched or needs_stretches(elements.law[e])
+    if stretched:
+        decompose_group(group, place, count, elements.tets, elements.inverse_rest, x, work_out)
+    for e in range(group * lanes, end):
+        F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
+        s = wp.vec3d()
+        if stretched:
+            s = read_vector(work_out, place * WORK * lanes + e - group * lanes, lanes, S_SLOT)
+        m = constants_of(elements, e)
+        density = energy_density(F, s, m)
+        rate = elements.damping[e] * inverse_dt
+        if rate > wp.float64(0.0):
+            strain = green_strain_increment(F, cauchy_green[e])
+            density += viscous_energy(strain, rate * m.mu, rate * m.lam)
+        energy_out[e] = elements.volume[e] * density
 
 
 @wp.func
@@ -209,7 +225,7 @@ def write_law(
     s = read_vector(work_out, at, lanes, S_SLOT)
     U = wp.mat33d()
     V = wp.mat33d()
-    if m.law == COROTATED or m.law == STVK_HENCKY:
+    if needs_stretches(m.law):
         U = read_matrix(work_out, at, lanes, U_SLOT)
         V = read_matrix(work_out, at, lanes, V_SLOT)
     stress = piola_stress_in_frame(F, U, s, V, m)

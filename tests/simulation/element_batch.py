@@ -89,9 +89,7 @@ class Batch:
     def energies(self, x: np.ndarray, inverse_dt: float = 0.0) -> np.ndarray:
         p = self.potential
         array = wp.array(x.reshape(-1, 3), dtype=wp.vec3d, device="cpu")
-        p.over_elements(
-            elements.element_energy, [p.elements, array, p._cauchy_green, inverse_dt], [p._energies]
-        )
+        p._evaluate_elements(array, inverse_dt)
         return p._energies.numpy()[: len(x)].copy()
 
     def derivatives(self, x: np.ndarray, inverse_dt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

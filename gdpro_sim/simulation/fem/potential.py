@@ -150,8 +150,7 @@ class IncrementalPotential:
         `elements_unchanged` reuses the element terms of the last call (when only lagged values changed).
         """
         if not elements_unchanged:
-            inputs = [self.elements, x, self._cauchy_green, self._inverse_h]
-            self.over_elements(elements.element_energy, inputs, [self._energies])
+            self._evaluate_elements(x, self._inverse_h)
             if self._averaged is not None:
                 self._averaged.energy(x, self._energies, len(self._energies) - self.vertex_count)
         first = self.element_count
@@ -162,6 +161,16 @@ class IncrementalPotential:
             term.energy(x, self._energies, first)
             first += term.energies
         return self._total(self._energies)
+
+    def _evaluate_elements(self, x: wp.array, inverse_h: float) -> None:
+        """Energies of the elements at x, the first of `_energies`; inverse_h = 0 leaves damping out."""
+        self._launch(
+            elements.element_energy,
+            self._groups,
+            [self._lanes, self.element_count, self.elements, x, self._cauchy_green, inverse_h],
+            [self._work, self._energies],
+            minimum=64,
+        )
 
     def linearise(self, x: wp.array) -> None:
         """Fill the linear system H d = -gradient at x."""
@@ -273,8 +282,7 @@ class IncrementalPotential:
 
     def elastic_energy(self, x: wp.array) -> float:
         """Energy stored in the elements at x, J."""
-        inputs = [self.elements, x, self._cauchy_green, 0.0]
-        self.over_elements(elements.element_energy, inputs, [self._energies])
+        self._evaluate_elements(x, 0.0)
         stored = float(self._energies.numpy()[: self.element_count].sum())
         if self._averaged is not None:
             self._averaged.energy(x, self._energies, len(self._energies) - self.vertex_count)
