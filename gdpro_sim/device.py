@@ -240,7 +240,7 @@ class Launches:
         *,
         minimum: int = 1024,
     ) -> None:
-        """Launch `kernel(start, *inputs, *outputs)` over `count` indices: once on CUDA, per core on the CPU."""
+        """Launch `kernel(start, *inputs, *outputs)` over `count` indices, on the CPU per core."""
         if count <= 0:
             return
         arguments = [*inputs, *outputs]

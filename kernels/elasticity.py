@@ -55,6 +55,7 @@ class Constants:
     lam: wp.float64
     limit: wp.float64  # present yield stress, Pa; inf: elastic. STVK_HENCKY alone yields
     hardening: wp.float64  # growth of the yield stress with plastic strain, Pa
+    exact: int  # not 0: Hessians as they are, not projected
     pressure: wp.float64  # Pa, added to dPsi/dJ in stress and Hessian, not in the energy; LINEAR takes none
 
 
@@ -113,14 +114,17 @@ def volumetric_derivatives(J: wp.float64, m: Constants):
 
 
 @wp.func
-def projected_pair(flip: wp.float64, twist: wp.float64) -> wp.vec2d:
-    """Projection of [[diagonal, off], [off, diagonal]] to positive semidefinite, as (diagonal, off).
+def projected_pair(flip: wp.float64, twist: wp.float64, m: Constants) -> wp.vec2d:
+    """[[diagonal, off], [off, diagonal]], positive semidefinite unless m.exact, as (diagonal, off).
 
     Its eigenvalues are diagonal + off for the symmetric combination (flip) and diagonal - off for the
     antisymmetric one (twist).
     """
-    up = wp.max(flip, wp.float64(0.0))
-    down = wp.max(twist, wp.float64(0.0))
+    up = flip
+    down = twist
+    if m.exact == 0:
+        up = wp.max(flip, wp.float64(0.0))
+        down = wp.max(twist, wp.float64(0.0))
     return wp.vec2d(wp.float64(0.5) * (up + down), wp.float64(0.5) * (up - down))
 
 
@@ -193,13 +197,15 @@ def hencky_hessian(s: wp.vec3d, m: Constants):
     flip0 = hencky_quotient(s[1], s[2], tau[1], shear) - more[0]
     flip1 = hencky_quotient(s[0], s[2], tau[0], shear) - more[1]
     flip2 = hencky_quotient(s[0], s[1], tau[0], shear) - more[2]
-    p0 = projected_pair(flip0, (P[1] + P[2]) / (s[1] + s[2]) + more[0])
-    p1 = projected_pair(flip1, (P[0] + P[2]) / (s[0] + s[2]) + more[1])
-    p2 = projected_pair(flip2, (P[0] + P[1]) / (s[0] + s[1]) + more[2])
+    p0 = projected_pair(flip0, (P[1] + P[2]) / (s[1] + s[2]) + more[0], m)
+    p1 = projected_pair(flip1, (P[0] + P[2]) / (s[0] + s[2]) + more[1], m)
+    p2 = projected_pair(flip2, (P[0] + P[1]) / (s[0] + s[1]) + more[2], m)
     zero = wp.float64(0.0)
     A = inverse * H * inverse
     A += wp.mat33d(zero, more[2], more[1], more[2], zero, more[0], more[1], more[0], zero)
-    return project_symmetric(A), wp.matrix_from_rows(p0, p1, p2)
+    if m.exact == 0:
+        A = project_symmetric(A)
+    return A, wp.matrix_from_rows(p0, p1, p2)
 
 
 # ---- every law ----
@@ -261,13 +267,15 @@ def piola_stress(F: wp.mat33d, m: Constants) -> wp.mat33d:
 
 @wp.func
 def principal_hessian(s: wp.vec3d, m: Constants):
-    """The projected Hessian of Psi in the frame of the singular vectors; for LINEAR, in that of the axes.
+    """The Hessian of Psi in the frame of the singular vectors; for LINEAR, in that of the axes.
+
+    It is projected to positive semidefinite unless m.exact.
 
     There it splits into a 3x3 block A over the diagonal of F ("scaling") and, for each pair i != j, a 2x2
     block over (F_ij, F_ji) with the eigenvalues (P_i - P_j) / (s_i - s_j) ("flip") and
     (P_i + P_j) / (s_i + s_j) ("twist"), P_i = dPsi/ds_i (Smith et al. 2019).
 
-    Returns A (projected) and `pairs`, whose row k holds (diagonal, off) for the pair without axis k.
+    Returns A and `pairs`, whose row k holds (diagonal, off) for the pair without axis k.
     """
     if m.law == STVK_HENCKY:
         return hencky_hessian(s, m)
@@ -301,10 +309,12 @@ def principal_hessian(s: wp.vec3d, m: Constants):
         a02, a12, mu + second * c[2] * c[2],
     )
     # fmt: on
-    p0 = projected_pair(mu - first * s[0], mu + first * s[0] - less[0])
-    p1 = projected_pair(mu - first * s[1], mu + first * s[1] - less[1])
-    p2 = projected_pair(mu - first * s[2], mu + first * s[2] - less[2])
-    return project_symmetric(A), wp.matrix_from_rows(p0, p1, p2)
+    p0 = projected_pair(mu - first * s[0], mu + first * s[0] - less[0], m)
+    p1 = projected_pair(mu - first * s[1], mu + first * s[1] - less[1], m)
+    p2 = projected_pair(mu - first * s[2], mu + first * s[2] - less[2], m)
+    if m.exact == 0:
+        A = project_symmetric(A)
+    return A, wp.matrix_from_rows(p0, p1, p2)
 
 
 @wp.func

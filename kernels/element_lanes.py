@@ -1,9 +1,9 @@
 """Deformation gradients, singular values and stiffness blocks of elements side by side, float64.
 
 A group is `LANES` elements on a CPU, one on a GPU. What belongs to the whole mesh and to no material is done
-for a group at once in vectors: F and its singular value decomposition before the constitutive law, the ten
-3x3 blocks after it. The law itself works on one element at a time between the two. What they hand each other
-stands in `work`: number `slot` of lane j of a group at work[(place WORK + slot) lanes + j].
+for a group at once in vectors: F and its singular value decomposition before the constitutive law, forces
+and the ten 3x3 blocks after it. The law works on one element at a time between the two. What they hand each
+other stands in `work`: number `slot` of lane j of a group at work[(place WORK + slot) lanes + j].
 
     F       9  deformation gradient, row by row
     S       3  singular values, as `gdpro_sim.kernels.decomposition.singular_value_decomposition` orders them
@@ -12,6 +12,7 @@ stands in `work`: number `slot` of lane j of a group at work[(place WORK + slot)
     G       9  gradients of the shape functions 1..3 in the frame of the right singular vectors, row by row
     A       9  Hessian over the diagonal of the rotated F, symmetric
     PAIRS   9  (F_ij, F_ij), (F_ji, F_ji), (F_ij, F_ji) of the Hessian for (i, j) = (1, 2), (0, 2), (0, 1)
+    STRESS  9  first Piola-Kirchhoff stress, row by row
 
 The Hessian of an isotropic law, over the rotated F, splits into these (Smith, de Goes & Kim 2019, "Analytic
 eigensystems for isotropic distortion energies", ACM TOG 38(1)).
@@ -29,7 +30,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS
 LANES = 8
 """Elements of a group on a CPU."""
 
-WORK = wp.constant(57)
+WORK = wp.constant(66)
 F_SLOT = wp.constant(0)
 S_SLOT = wp.constant(9)
 U_SLOT = wp.constant(12)
@@ -37,6 +38,7 @@ V_SLOT = wp.constant(21)
 G_SLOT = wp.constant(30)
 A_SLOT = wp.constant(39)
 PAIR_SLOT = wp.constant(48)
+STRESS_SLOT = wp.constant(57)
 
 
 def _merge(half: int) -> tuple[str, str]:
@@ -251,7 +253,7 @@ def decompose_group(
     ...
 
 
-_BLOCKS = f"""
+_DERIVATIVES = f"""
 {_PRELUDE}
     D U[9], G[9], P[9];
     for (int i = 0; i < 9; ++i) {{
@@ -299,19 +301,37 @@ _BLOCKS = f"""
             out[at] = -(out[9 + at] + out[18 + at] + out[27 + at]);
         }}
     store_rows((double*)(blocks_out.data + 10 * (size_t)first), 90, 90, out);
+
+    // Forces V P grad N of corners 1..3, and what balances them.
+    const double* const inverse = (const double*)(inverse_rest.data + first);
+    D forces[12];
+    for (int a = 1; a < 4; ++a) {{
+        const D g0 = scale * load(inverse + 3 * a - 3, 9), g1 = scale * load(inverse + 3 * a - 2, 9),
+            g2 = scale * load(inverse + 3 * a - 1, 9);
+        for (int i = 0; i < 3; ++i)
+            forces[3 * a + i] = get({STRESS_SLOT} + 3 * i) * g0 + get({STRESS_SLOT} + 3 * i + 1) * g1
+                + get({STRESS_SLOT} + 3 * i + 2) * g2;
+    }}
+    for (int i = 0; i < 3; ++i) forces[i] = -(forces[3 + i] + forces[6 + i] + forces[9 + i]);
+    store_rows((double*)(gradient_out.data + 4 * (size_t)first), 12, 12, forces);
 """
 
 
-@wp.func_native(_BLOCKS)
-def write_blocks_group(
+@wp.func_native(_DERIVATIVES)
+def write_derivatives_group(
     group: int,
     place: int,
     count: int,
+    inverse_rest: wp.array[wp.mat33d],
     volume: wp.array[wp.float64],
     work: wp.array[wp.float64],
+    gradient_out: wp.array[wp.vec3d],
     blocks_out: wp.array[wp.mat33d],
 ):
-    """The Hessian of one group, 10 blocks (a <= b, row by row) of each element, from U, G, A and PAIRS."""
+    """Gradient (4 vectors) and Hessian (10 blocks, a <= b, row by row) of each element of one group.
+
+    From STRESS, and from U, G, A and PAIRS.
+    """
     ...
 
 

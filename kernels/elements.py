@@ -32,13 +32,14 @@ from gdpro_sim.kernels.element_lanes import (
     G_SLOT,
     PAIR_SLOT,
     S_SLOT,
+    STRESS_SLOT,
     U_SLOT,
     V_SLOT,
     WORK,
     decompose_group,
     read_matrix,
     read_vector,
-    write_blocks_group,
+    write_derivatives_group,
     write_matrix,
 )
 from gdpro_sim.kernels.lanes import CPU_FLAGS
@@ -163,31 +164,6 @@ def element_energy(
         energy_out[e] = elements.volume[e] * density
 
 
-@wp.func
-def write_forces(
-    e: int,
-    elements: Elements,
-    F: wp.mat33d,
-    stress: wp.mat33d,
-    m: Constants,
-    cauchy_green: wp.array[wp.mat33d],
-    rate: wp.float64,
-    gradient_out: wp.array[wp.vec3d],
-):
-    """The four vectors of an element's gradient; `rate` is its damping over the step, 0 for none."""
-    P = stress
-    if rate > wp.float64(0.0):
-        P += viscous_stress(F, green_strain_increment(F, cauchy_green[e]), rate * m.mu, rate * m.lam)
-    forces = (elements.volume[e] * P) * wp.transpose(elements.inverse_rest[e])
-    f1 = wp.vec3d(forces[0, 0], forces[1, 0], forces[2, 0])
-    f2 = wp.vec3d(forces[0, 1], forces[1, 1], forces[2, 1])
-    f3 = wp.vec3d(forces[0, 2], forces[1, 2], forces[2, 2])
-    gradient_out[4 * e] = -(f1 + f2 + f3)
-    gradient_out[4 * e + 1] = f1
-    gradient_out[4 * e + 2] = f2
-    gradient_out[4 * e + 3] = f3
-
-
 @wp.kernel
 def element_gradient(
     start: int,
@@ -204,7 +180,17 @@ def element_gradient(
     F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
     m = constants_of(elements, e)
     rate = elements.damping[e] * inverse_dt
-    write_forces(e, elements, F, piola_stress(F, m), m, cauchy_green, rate, gradient_out)
+    P = piola_stress(F, m)
+    if rate > wp.float64(0.0):
+        P += viscous_stress(F, green_strain_increment(F, cauchy_green[e]), rate * m.mu, rate * m.lam)
+    forces = (elements.volume[e] * P) * wp.transpose(elements.inverse_rest[e])
+    f1 = wp.vec3d(forces[0, 0], forces[1, 0], forces[2, 0])
+    f2 = wp.vec3d(forces[0, 1], forces[1, 1], forces[2, 1])
+    f3 = wp.vec3d(forces[0, 2], forces[1, 2], forces[2, 2])
+    gradient_out[4 * e] = -(f1 + f2 + f3)
+    gradient_out[4 * e + 1] = f1
+    gradient_out[4 * e + 2] = f2
+    gradient_out[4 * e + 3] = f3
 
 
 @wp.func
@@ -215,11 +201,12 @@ def write_law(
     elements: Elements,
     cauchy_green: wp.array[wp.mat33d],
     inverse_dt: wp.float64,
+    exact: int,
     work_out: wp.array[wp.float64],
-    gradient_out: wp.array[wp.vec3d],
 ):
-    """Gradient of element e, and its projected Hessian in the frame of the singular vectors."""
+    """Stress of element e, and its Hessian in the frame of the singular vectors, projected unless `exact`."""
     m = constants_of(elements, e)
+    m.exact = exact
     rate = elements.damping[e] * inverse_dt
     F = read_matrix(work_out, at, lanes, F_SLOT)
     s = read_vector(work_out, at, lanes, S_SLOT)
@@ -229,7 +216,10 @@ def write_law(
         U = read_matrix(work_out, at, lanes, U_SLOT)
         V = read_matrix(work_out, at, lanes, V_SLOT)
     stress = piola_stress_in_frame(F, U, s, V, m)
-    write_forces(e, elements, F, stress, m, cauchy_green, rate, gradient_out)
+    if rate > wp.float64(0.0):
+        strain = green_strain_increment(F, cauchy_green[e])
+        stress += viscous_stress(F, strain, rate * m.mu, rate * m.lam)
+    write_matrix(stress, at, lanes, STRESS_SLOT, work_out)
     A, halves = principal_hessian(s, m)
     pairs = wp.matrix_from_rows(
         wp.vec3d(halves[0, 0], halves[0, 0], halves[0, 1]),
@@ -258,15 +248,17 @@ def element_derivatives(
     x: wp.array[wp.vec3d],
     cauchy_green: wp.array[wp.mat33d],
     inverse_dt: wp.float64,
+    exact: int,
     # Work:
     work_out: wp.array[wp.float64],
     # Out:
     gradient_out: wp.array[wp.vec3d],
     blocks_out: wp.array[wp.mat33d],
 ):
-    """Gradient (4 vectors) and projected Hessian (10 blocks, a <= b, row by row) of each element.
+    """Gradient (4 vectors) and Hessian (10 blocks, a <= b, row by row) of each element.
 
-    The index is a group of `lanes` of the `count` elements, see `gdpro_sim.kernels.element_lanes`.
+    Hessians are projected unless `exact`. The index is a group of `lanes` of the `count` elements, see
+    `gdpro_sim.kernels.element_lanes`.
     """
     group = start + wp.tid()
     # A CPU launch goes through its groups one after the other: they can share the first one's work.
@@ -274,8 +266,10 @@ def element_derivatives(
     decompose_group(group, place, count, elements.tets, elements.inverse_rest, x, work_out)
     for e in range(group * lanes, wp.min(count, (group + 1) * lanes)):
         at = place * WORK * lanes + e - group * lanes
-        write_law(e, at, lanes, elements, cauchy_green, inverse_dt, work_out, gradient_out)
-    write_blocks_group(group, place, count, elements.volume, work_out, blocks_out)
+        write_law(e, at, lanes, elements, cauchy_green, inverse_dt, exact, work_out)
+    write_derivatives_group(
+        group, place, count, elements.inverse_rest, elements.volume, work_out, gradient_out, blocks_out
+    )
 
 
 @wp.kernel

@@ -31,10 +31,36 @@ class Vertices:
     corners: wp.array[wp.int32]  # 4 * element + corner
 
 
-@wp.func
-def diagonal_slot(corner: int) -> int:
-    """Place of block (corner, corner) among an element's 10 blocks: 0, 4, 7, 9."""
-    return corner * (9 - corner) // 2
+@wp.func_native("""
+    // Block (c, c) is at place 0, 4, 7 or 9 of an element's 10. They lie far apart: those of the next
+    // vertices are fetched while these are added.
+    const double* const blocks_ = (const double*)blocks.data;
+    const int* const codes = corners.data;
+    const int last = corners.shape[0] - 1;
+    auto block_of = [&](int k) {
+        const int c = codes[k] & 3;
+        return blocks_ + 9 * (size_t)(10 * (codes[k] >> 2) + c * (9 - c) / 2);
+    };
+    double sum[9] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    for (int k = begin; k < end; ++k) {
+#if !defined(__CUDACC__)
+        const double* const next = block_of(k + 16 < last ? k + 16 : last);
+        __builtin_prefetch(next);
+        __builtin_prefetch(next + 8);
+#endif
+        const double* const m = block_of(k);
+        for (int i = 0; i < 9; ++i) sum[i] += m[i];
+    }
+    return wp::mat33d(sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], sum[6], sum[7], sum[8]);
+""")
+def sum_diagonal_blocks(
+    begin: int,
+    end: int,
+    corners: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33d],
+) -> wp.mat33d:
+    """Sum over k in [begin, end) of an element's block of corners[k] with itself."""
+    ...
 
 
 @wp.kernel
@@ -121,11 +147,11 @@ def assemble_vertices(
     """
     i = start + wp.tid()
     slope = gradient[i]
-    curvature = block[i]
-    for k in range(vertices.offsets[i], vertices.offsets[i + 1]):
-        code = vertices.corners[k]
-        slope += element_gradient[code]
-        curvature += element_blocks[10 * (code >> 2) + diagonal_slot(code & 3)]
+    begin = vertices.offsets[i]
+    end = vertices.offsets[i + 1]
+    curvature = block[i] + sum_diagonal_blocks(begin, end, vertices.corners, element_blocks)
+    for k in range(begin, end):
+        slope += element_gradient[vertices.corners[k]]
     position = x[i]
     inertial = vertices.mass[i] * inverse_dt * inverse_dt
     damping = vertices.mass[i] * inverse_dt * vertices.damping[i]

@@ -22,7 +22,7 @@ CG_ALPHA = wp.constant(0)
 CG_BETA = wp.constant(1)
 CG_RZ = wp.constant(2)
 CG_RZ_START = wp.constant(3)
-CG_DONE = wp.constant(4)
+CG_DONE = wp.constant(4)  # 1: converged, -1: the matrix or the preconditioner is not positive definite
 CG_ITERATIONS = wp.constant(5)
 
 
@@ -103,6 +103,37 @@ def sum_ranges(
     sums_out[i] = total
 
 
+@wp.func_native("""
+    // Blocks lie far apart: those of the next pairs are fetched while these are added.
+    const double* const blocks_ = (const double*)blocks.data;
+    const int* const codes = contributions.data;
+    const int last = contributions.shape[0] - 1;
+    double sum[9] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    for (int k = begin; k < end; ++k) {
+#if !defined(__CUDACC__)
+        const double* const next = blocks_ + 9 * (size_t)(codes[k + 16 < last ? k + 16 : last] >> 1);
+        __builtin_prefetch(next);
+        __builtin_prefetch(next + 8);
+#endif
+        const double* const m = blocks_ + 9 * (size_t)(codes[k] >> 1);
+        if (codes[k] & 1) {
+            for (int i = 0; i < 9; ++i) sum[i] += m[3 * (i % 3) + i / 3];
+        } else {
+            for (int i = 0; i < 9; ++i) sum[i] += m[i];
+        }
+    }
+    return wp::mat33d(sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], sum[6], sum[7], sum[8]);
+""")
+def sum_blocks(
+    begin: int,
+    end: int,
+    contributions: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33d],
+) -> wp.mat33d:
+    """Sum over k in [begin, end) of blocks[contributions[k] >> 1], transposed where the lowest bit is set."""
+    ...
+
+
 @wp.kernel
 def gather_off_diagonal(
     start: int,
@@ -120,14 +151,7 @@ def gather_off_diagonal(
     A contribution is 2 * (index of the element block) + (1 if it enters transposed).
     """
     i = start + wp.tid()
-    total = wp.mat33d()
-    for k in range(offsets[i], offsets[i + 1]):
-        code = contributions[k]
-        block = element_blocks[code >> 1]
-        if (code & 1) != 0:
-            total += wp.transpose(block)
-        else:
-            total += block
+    total = sum_blocks(offsets[i], offsets[i + 1], contributions, element_blocks)
     values_out[upper[i]] = total
     values_out[lower[i]] = wp.transpose(total)
 
@@ -215,8 +239,8 @@ _CG_SERIAL = f"""
     const double target = rz * tolerance * tolerance;
     double beta = 0.0;
     int iteration = 0;
-    bool done = rz <= 0.0;
-    while (!done && iteration < max_iterations) {{
+    bool done = rz == 0.0, definite = rz >= 0.0;
+    while (!done && definite && iteration < max_iterations) {{
         for (int i = 0; i < rows; ++i) {{
             const size_t at = 4 * (size_t)i;
             store(p + at, load(z + at) + beta * load(p + at));
@@ -283,7 +307,8 @@ _CG_SERIAL = f"""
                 pq += dot(load(p + at), t);
             }}
         }}
-        if (!(pq > 0.0)) break;
+        definite = pq > 0.0;
+        if (!definite) break;
         const double alpha = rz / pq;
         const double previous = rz;
         rz = 0.0;
@@ -295,7 +320,8 @@ _CG_SERIAL = f"""
         }}
         beta = rz / previous;
         ++iteration;
-        done = rz <= target;
+        definite = rz >= 0.0;
+        done = definite && rz <= target;
     }}
     for (int i = 0; i < rows; ++i)
         for (int j = 0; j < 3; ++j) {{
@@ -304,7 +330,7 @@ _CG_SERIAL = f"""
         }}
     scalars[{CG_RZ}] = rz;
     scalars[{CG_ITERATIONS}] = iteration;
-    scalars[{CG_DONE}] = done ? 1.0 : 0.0;
+    scalars[{CG_DONE}] = done ? 1.0 : definite ? 0.0 : -1.0;
 #endif
 """
 
@@ -335,6 +361,7 @@ def cg_solve(
 
 @wp.kernel
 def cg_serial(
+    _start: int,
     # In:
     rows: int,
     max_iterations: int,
@@ -528,7 +555,11 @@ def cg_begin(
     scalars_out[CG_RZ] = total
     scalars_out[CG_RZ_START] = total
     scalars_out[CG_ITERATIONS] = wp.float64(0.0)
-    scalars_out[CG_DONE] = wp.where(total <= wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
+    scalars_out[CG_DONE] = wp.float64(0.0)
+    if total == wp.float64(0.0):
+        scalars_out[CG_DONE] = wp.float64(1.0)
+    elif not (total > wp.float64(0.0)):
+        scalars_out[CG_DONE] = wp.float64(-1.0)
 
 
 @wp.kernel
@@ -541,13 +572,16 @@ def cg_set_alpha(
     # Out:
     scalars_out: wp.array[wp.float64],
 ):
-    """alpha = r.z / p.q; zero once converged, so that steps taken past convergence change nothing."""
+    """alpha = r.z / p.q; zero once done, so that steps taken past the end change nothing."""
     total = wp.float64(0.0)
     for k in range(count):
         total += dots[k]
     alpha = wp.float64(0.0)
-    if scalars_out[CG_DONE] == wp.float64(0.0) and total > wp.float64(0.0):
-        alpha = scalars_out[CG_RZ] / total
+    if scalars_out[CG_DONE] == wp.float64(0.0):
+        if total > wp.float64(0.0):
+            alpha = scalars_out[CG_RZ] / total
+        else:
+            scalars_out[CG_DONE] = wp.float64(-1.0)
     scalars_out[CG_ALPHA] = alpha
 
 
@@ -569,5 +603,7 @@ def cg_set_beta(
         scalars_out[CG_BETA] = total / scalars_out[CG_RZ]
         scalars_out[CG_RZ] = total
         scalars_out[CG_ITERATIONS] = scalars_out[CG_ITERATIONS] + wp.float64(1.0)
-        if total <= scalars_out[CG_RZ_START] * tolerance[0] * tolerance[0]:
+        if not (total >= wp.float64(0.0)):
+            scalars_out[CG_DONE] = wp.float64(-1.0)
+        elif total <= scalars_out[CG_RZ_START] * tolerance[0] * tolerance[0]:
             scalars_out[CG_DONE] = wp.float64(1.0)

@@ -82,7 +82,7 @@ def test_iteration_cap_is_reported() -> None:
     for serial in (True, False):
         potential.system.serial = serial
         report = potential.system.solve(1e-10, 3)
-        assert report == (3, False)
+        assert report == (3, False, True)
 
 
 def test_unconverged_steps_say_so(caplog: pytest.LogCaptureFixture) -> None:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from gdpro_sim.device import run_chunks
+from gdpro_sim.device import Launches
 from gdpro_sim.kernels import linalg
 from gdpro_sim.simulation.fem.topology import Topology
 
@@ -22,8 +22,11 @@ CUDA_CHECK_EVERY = 16
 
 
 class SolveReport(NamedTuple):
+    """`definite` is False where a direction without positive curvature ended the solve."""
+
     iterations: int
     converged: bool
+    definite: bool
 
 
 class ConjugateGradient:
@@ -63,7 +66,7 @@ class ConjugateGradient:
         if device == "cpu":
             # Before several threads could each try to build it.
             wp.load_module(linalg, device=device)
-        self._commands: dict[tuple[str, int, int], wp.Launch] = {}
+        self._launch = Launches(device)
 
     def couple(self, blocks: Any | None) -> None:
         """Add off-diagonal blocks, a symmetric scipy.sparse.bsr_matrix of 3x3 blocks over all rows, to A.
@@ -79,7 +82,6 @@ class ConjugateGradient:
         if count > len(self._extra_columns):
             self._extra_columns = wp.zeros(2 * count, dtype=wp.int32, device=self.device)
             self._extra_values = wp.zeros(2 * count, dtype=wp.mat33d, device=self.device)
-            self._commands.clear()  # they hold the old arrays
         self._extra_offsets.assign(np.ascontiguousarray(blocks.indptr, np.int32))
         if count:
             columns: wp.array = wp.array(blocks.indices.astype(np.int32), dtype=wp.int32, device=self.device)
@@ -119,13 +121,14 @@ class ConjugateGradient:
         else:
             self._solve_phases(tolerance, max_iterations)
         scalars = self._scalars.numpy()
-        return SolveReport(int(scalars[linalg.CG_ITERATIONS]), bool(scalars[linalg.CG_DONE]))
+        done = float(scalars[linalg.CG_DONE])
+        return SolveReport(int(scalars[linalg.CG_ITERATIONS]), done > 0.0, done >= 0.0)
 
     def _solve_serial(self, tolerance: float, max_iterations: int) -> None:
-        wp.launch(
+        self._launch(
             linalg.cg_serial,
-            dim=1,
-            inputs=[
+            1,
+            [
                 self.rows,
                 max_iterations,
                 tolerance,
@@ -142,8 +145,7 @@ class ConjugateGradient:
                 self.inverse_diagonal,
                 self.right_hand_side,
             ],
-            outputs=[self._work, self.residual, self.solution, self._scalars],
-            device=self.device,
+            [self._work, self.residual, self.solution, self._scalars],
         )
 
     def _solve_phases(self, tolerance: float, max_iterations: int) -> None:
@@ -186,40 +188,17 @@ class ConjugateGradient:
             self._scalar(linalg.cg_set_beta)
 
     def _over_rows(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        arguments = [self.rows, self.blocks, *inputs]
-        if self.device != "cpu":
-            self._launch(kernel, 0, self.blocks, arguments, outputs)
-            return
-        run_chunks(
-            lambda begin, end: self._launch(kernel, begin, end, arguments, outputs),
-            self.blocks,
-            ROW_BLOCKS // 16,
-        )
+        minimum = ROW_BLOCKS // 16
+        self._launch(kernel, self.blocks, [self.rows, self.blocks, *inputs], outputs, minimum=minimum)
 
     def _scalar(self, kernel: wp.Kernel) -> None:
         """One of the scalar steps, over the partial sums of the phase before it."""
         dots, count = self._dots, self.blocks
         if self.device != "cpu":
             sums = [self._sums]
-            self._launch(linalg.sum_ranges, 0, ROW_BLOCKS, [count, ROW_BLOCKS, dots], sums)
+            self._launch(linalg.sum_ranges, ROW_BLOCKS, [count, ROW_BLOCKS, dots], sums)
             dots, count = self._sums, ROW_BLOCKS
-        self._launch(kernel, 0, 1, [count, dots, self._tolerance], [self._scalars])
-
-    def _launch(self, kernel: wp.Kernel, begin: int, end: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch over [begin, end). The arguments of a range never change, so they are packed once."""
-        key = (kernel.key, begin, end)
-        command = self._commands.get(key)
-        if command is None:
-            command = wp.launch(
-                kernel,
-                dim=end - begin,
-                inputs=[begin, *inputs],
-                outputs=outputs,
-                device=self.device,
-                record_cmd=True,
-            )
-            self._commands[key] = command
-        command.launch()
+        self._launch(kernel, 1, [count, dots, self._tolerance], [self._scalars])
 
     def matrix(self) -> Any:
         """A without G^T D G as a scipy BSR matrix.

@@ -172,11 +172,11 @@ class IncrementalPotential:
             minimum=64,
         )
 
-    def linearise(self, x: wp.array) -> None:
-        """Fill the linear system H d = -gradient at x."""
+    def linearise(self, x: wp.array, *, exact: bool = False) -> None:
+        """Fill the linear system H d = -gradient at x; elements' parts are projected unless `exact`."""
         system = self.system
         self._press(x)
-        self.differentiate_elements(x)
+        self.differentiate_elements(x, exact=exact)
         self._launch(
             linalg.gather_off_diagonal,
             self._pair_count,
@@ -204,12 +204,20 @@ class IncrementalPotential:
             [system.right_hand_side, system.values, system.inverse_diagonal],
         )
 
-    def differentiate_elements(self, x: wp.array) -> None:
-        """Gradients and projected Hessian blocks of the elements at x."""
+    def differentiate_elements(self, x: wp.array, *, exact: bool = False) -> None:
+        """Gradients and Hessian blocks of the elements at x, projected unless `exact`."""
         self._launch(
             elements.element_derivatives,
             self._groups,
-            [self._lanes, self.element_count, self.elements, x, self._cauchy_green, self._inverse_h],
+            [
+                self._lanes,
+                self.element_count,
+                self.elements,
+                x,
+                self._cauchy_green,
+                self._inverse_h,
+                int(exact),
+            ],
             [self._work, self.element_gradient, self._element_blocks],
             minimum=64,
         )

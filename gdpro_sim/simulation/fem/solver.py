@@ -13,10 +13,11 @@ import warp as wp
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import fem
 from gdpro_sim.simulation.fem.colliders import collider_contacts
+from gdpro_sim.simulation.fem.conjugate_gradient import SolveReport
 from gdpro_sim.simulation.fem.contact import body_contact
 from gdpro_sim.simulation.fem.forces import force_terms
 from gdpro_sim.simulation.fem.integrators import ImplicitStep, State
-from gdpro_sim.simulation.fem.potential import IncrementalPotential
+from gdpro_sim.simulation.fem.potential import IncrementalPotential, StepMeasures
 from gdpro_sim.simulation.fem.rest import rest_shapes
 from gdpro_sim.simulation.fem.rigid_modes import RigidModes
 from gdpro_sim.simulation.fem.term import Step, Term
@@ -296,7 +297,7 @@ class SolverFEM:
         energy = self._choose_start()
         if not math.isfinite(energy):
             return _Outcome(converged=False, finite=False, residual=math.inf)
-        residual = math.inf
+        residual, exact = math.inf, True
         for iteration in range(settings.newton_iterations):
             wp.copy(potential.start, potential.trial)
             # Lagged values follow the iterate, then stay, so that the late iterations descend on one fixed
@@ -304,30 +305,43 @@ class SolverFEM:
             if iteration <= settings.newton_iterations // 2:
                 potential.lag(potential.start)
                 energy = potential.energy(potential.start, elements_unchanged=True)
-            potential.linearise(potential.start)
+            potential.linearise(potential.start, exact=exact)
             acceleration = potential.largest_acceleration()
             if not (math.isfinite(energy) and math.isfinite(acceleration)):
                 return _Outcome(converged=False, finite=False, residual=residual)
             if acceleration * h * h <= NEGLIGIBLE * tolerance:
                 return _Outcome(converged=True, finite=True, residual=acceleration * h)
 
-            report = potential.system.solve(settings.cg_tolerance, settings.cg_iterations)
-            slope, largest_move = potential.step_measures()
+            report, (slope, largest_move) = self._solve()
+            if exact and not (report.definite and slope < 0.0):
+                # No minimum of the quadratic model: for the rest of this step, elements are projected.
+                exact = False
+                potential.linearise(potential.start)
+                report, (slope, largest_move) = self._solve()
             negligible = NEGLIGIBLE * max(tolerance, 0.1 * largest_move) / (h * h)
             if self._rigid.correct(potential.system, potential.start.numpy(), negligible):
                 slope, largest_move = potential.step_measures()
             self._counters.newton_iterations += 1
-            self._counters.cg_iterations += report.iterations
             residual = largest_move / h
             if not (math.isfinite(slope) and math.isfinite(largest_move)):
                 return _Outcome(converged=False, finite=False, residual=residual)
 
             length, energy = self._line_search(energy, slope)
             if length == 0.0:
-                return _Outcome(converged=False, finite=True, residual=residual)
+                if not exact:
+                    return _Outcome(converged=False, finite=True, residual=residual)
+                exact = False
+                continue
             if report.converged and length == 1.0 and largest_move <= tolerance:
                 return _Outcome(converged=True, finite=True, residual=residual)
         return _Outcome(converged=False, finite=True, residual=residual)
+
+    def _solve(self) -> tuple[SolveReport, StepMeasures]:
+        """Solve the linear system as it stands."""
+        settings, potential = self.model.fem, self._potential
+        report = potential.system.solve(settings.cg_tolerance, settings.cg_iterations)
+        self._counters.cg_iterations += report.iterations
+        return report, potential.step_measures()
 
     def _choose_start(self) -> float:
         """Put the lowest guess that can be reached into the trial: resting, coasting, falling.
