@@ -50,9 +50,11 @@ def test_every_noun_is_a_closed_standing_object_with_colours(name: str) -> None:
 def test_every_variation_is_closed_and_nothing_hangs_in_the_air(name: str) -> None:
     for seed in (1, 2, 3):
         thing = build(parse(name), seed)
-        check(thing.surface(96), name)
-        volume = validate(*mesh_of(thing, 96)).volume
-        assert volume == pytest.approx(validate(*mesh_of(thing, 64)).volume, rel=0.12), name
+        surface = thing.surface(96)
+        check(surface, name)
+        if seed == 1:
+            volume = validate(surface.vertices, surface.faces).volume
+            assert volume == pytest.approx(validate(*mesh_of(thing, 64)).volume, rel=0.12), name
 
 
 def mesh_of(thing: ParametricObject, cells: int) -> tuple[np.ndarray, np.ndarray]:
