@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from gdpro_sim.simulation.verification.beams import Beam
+from gdpro_sim.meshing.embedding import boundary
+from gdpro_sim.simulation.conditions import Force, Pressure
+from gdpro_sim.simulation.verification.beams import STANDARD_GRAVITY, Beam
 from gdpro_sim.simulation.verification.framework import Check, absolute, at_least, at_most, problem, relative
 from gdpro_sim.simulation.verification.models import make_model, tet_box, uneven_box
 from gdpro_sim.simulation.verification.probe import TIGHT, Probe, order, settled, start, without_locking
@@ -37,47 +39,53 @@ def patch() -> Iterator[Check]:
     yield at_most("solved from a disturbed start: off by", 1e-9, np.abs(found - exact).max(), "m")
 
 
-def _cantilever(beam: Beam, cells: int, *, tip_load: float = 0.0) -> dict[str, np.ndarray]:
-    """Mesh of `cells` across the section and cubes along, pins, tip vertices, density per element."""
+def _cantilever(beam: Beam, cells: int) -> dict[str, np.ndarray]:
+    """Mesh of `cells` across the section and cubes along, pins, tip vertices."""
     along = round(cells * beam.length / beam.side)
     vertices, tets = tet_box((along, cells, cells), (beam.length, beam.side, beam.side))
-    density = np.full(len(tets), beam.density)
-    if tip_load > 0.0:
-        last = vertices[tets, 0].min(axis=1) > beam.length - 1.5 * beam.length / along
-        density[last] = tip_load / 9.81 / (beam.side**2 * beam.length / along)
-        density[~last] = 1e-3
-    return {
-        "vertices": vertices,
-        "tets": tets,
-        "density": density,
-        "pinned": vertices[:, 0] == 0.0,
-        "tip": np.isclose(vertices[:, 0], beam.length),
-    }
+    pinned, tip = vertices[:, 0] == 0.0, np.isclose(vertices[:, 0], beam.length)
+    return {"vertices": vertices, "tets": tets, "pinned": pinned, "tip": tip}
 
 
-def _drop(beam: Beam, mesh: dict[str, np.ndarray], **options: str) -> tuple[float, float]:
-    """(reach, drop) of the middle of the tip under gravity, m, by the quasi-static solver."""
+def _drop(beam: Beam, mesh: dict[str, np.ndarray], tip_load: float = 0.0) -> tuple[float, float]:
+    """(reach, drop) of the middle of the tip, m, by the quasi-static solver.
+
+    Under the beam's own weight, or under `tip_load` N on the tip alone.
+    """
+    tip = np.flatnonzero(mesh["tip"])
+    loads = (Force(tip, np.tile([0.0, 0.0, -tip_load / len(tip)], (len(tip), 1))),)
     model = make_model(
         mesh["vertices"],
         mesh["tets"],
         young=beam.young,
         poisson=beam.poisson,
-        density=mesh["density"],
+        density=beam.density,
         pinned=mesh["pinned"],
+        gravity=(0, 0, 0) if tip_load > 0.0 else (0, 0, -STANDARD_GRAVITY),
+        loads=loads if tip_load > 0.0 else (),
         integrator="quasi-static",
         newton_tolerance=1e-6,
         newton_iterations=60,
     )
-    x = settled(model)[mesh["tip"]].mean(axis=0)
+    x = settled(model)[tip].mean(axis=0)
     return float(x[0]), float(beam.side / 2 - x[2])
 
 
-def _reference_drop(beam: Beam, mesh: dict[str, np.ndarray]) -> tuple[float, float]:
+def _reference_drop(beam: Beam, mesh: dict[str, np.ndarray], tip_load: float = 0.0) -> tuple[float, float]:
     """The same by the float64 oracle."""
+    gravity = 0.0 if tip_load > 0.0 else -STANDARD_GRAVITY
     oracle = ReferenceFem(
-        mesh["vertices"], mesh["tets"], beam.young, beam.poisson, mesh["density"], mesh["pinned"]
+        mesh["vertices"],
+        mesh["tets"],
+        beam.young,
+        beam.poisson,
+        beam.density,
+        mesh["pinned"],
+        (0.0, 0.0, gravity),
     )
-    x = oracle.equilibrium()[mesh["tip"]].mean(axis=0)
+    load = np.zeros_like(mesh["vertices"])
+    load[mesh["tip"], 2] = -tip_load / mesh["tip"].sum()
+    x = oracle.equilibrium(load)[mesh["tip"]].mean(axis=0)
     return float(x[0]), float(beam.side / 2 - x[2])
 
 
@@ -91,15 +99,10 @@ SLENDER = Beam(length=1.0, side=0.1, young=2e6, poisson=0.3, density=1000.0)
 """Sags by half of its length."""
 
 
-def _extrapolated(beam: Beam, cells: list[int], bound: float, *, tip_load: float = 0.0) -> Iterator[Check]:
+def _extrapolated(beam: Beam, cells: list[int], bound: float, tip_load: float = 0.0) -> Iterator[Check]:
     """Sag on ever finer meshes: it grows, and its limit is that of beam theory."""
-    ratios = []
-    for across in cells:
-        mesh = _cantilever(beam, across, tip_load=tip_load)
-        theory = beam.sag()
-        if tip_load > 0.0:
-            theory = beam.tip_deflection(tip_load, beam.length - 0.5 * beam.side / across)
-        ratios.append(_drop(beam, mesh)[1] / theory)
+    theory = beam.tip_deflection(tip_load, beam.length) if tip_load > 0.0 else beam.sag()
+    ratios = [_drop(beam, _cantilever(beam, across), tip_load)[1] / theory for across in cells]
     for across, ratio in zip(cells, ratios, strict=True):
         yield at_most(f"nu = {beam.poisson:g}: sag / theory, {across} cells across", 1.0, ratio)
     yield at_least("least growth of that from mesh to mesh", 0.0, np.diff(ratios).min())
@@ -133,13 +136,40 @@ def cantilever_fine() -> Iterator[Check]:
 @problem(
     "cantilever-tip",
     title="The same cantilever without weight, 100 N at its tip",
-    source="Timoshenko: F a^2 (3 L - a) / 6 EI + F a / kappa G A, a the middle of the last cells",
+    source="Timoshenko: F L^3 / 3 EI + F L / kappa G A; float64 reference with a direct solver",
 )
 def cantilever_tip() -> Iterator[Check]:
-    mesh = _cantilever(STUBBY, 3, tip_load=100.0)
+    mesh = _cantilever(STUBBY, 3)
+    expected, found = _reference_drop(STUBBY, mesh, 100.0)[1], _drop(STUBBY, mesh, 100.0)[1]
     quantity = f"nu = 0.3: tip deflection, {len(mesh['tets'])} tets, reference on the same mesh"
-    yield relative(quantity, _reference_drop(STUBBY, mesh)[1], _drop(STUBBY, mesh)[1], 0.01, "m")
+    yield relative(quantity, expected, found, 0.01, "m")
     yield from _extrapolated(SLIPPING, [3, 4, 6], 0.02, tip_load=100.0)
+
+
+@problem(
+    "pressure",
+    title="A cube under pressure from all sides shrinks evenly",
+    source="small strains: dV / V = -p / K, K = E / 3 (1 - 2 nu), whatever the mesh",
+)
+def pressure() -> Iterator[Check]:
+    vertices, tets, _ = uneven_box(3, 0.5)
+    for poisson in (0.0, 0.3, 0.45):
+        young, amount = 1e6, 1.0
+        model = make_model(
+            vertices,
+            tets,
+            young=young,
+            poisson=poisson,
+            gravity=(0, 0, 0),
+            loads=(Pressure(boundary(tets)[0], amount, closed=True),),
+            integrator="quasi-static",
+            newton_tolerance=1e-12,
+            cg_tolerance=1e-8,
+        )
+        corners = settled(model)[tets]
+        volume = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6.0
+        expected = -amount * 3.0 * (1.0 - 2.0 * poisson) / young
+        yield relative(f"nu = {poisson:g}: dV / V", expected, volume / 0.125 - 1.0, 1e-4)
 
 
 @problem(
@@ -268,6 +298,16 @@ def order_h() -> Iterator[Check]:
     yield absolute("order, 3^3 to 12^3 cells", 2.0, order(sizes, errors), 0.25)
 
 
-PROBLEMS = (patch, cantilever, cantilever_fine, cantilever_tip, elastica, torsion, static_dt, order_h)
+PROBLEMS = (
+    patch,
+    cantilever,
+    cantilever_fine,
+    cantilever_tip,
+    pressure,
+    elastica,
+    torsion,
+    static_dt,
+    order_h,
+)
 
 __all__ = ["PROBLEMS"]

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from gdpro_sim.materials import LAWS
+from gdpro_sim.simulation.colliders import Collider
+from gdpro_sim.simulation.conditions import Load
 from gdpro_sim.simulation.model import FemSettings, Ground, Model
 
 
@@ -83,6 +85,8 @@ def make_model(
     law: str | None = None,
     yield_stress: float | None = None,
     hardening: float = 0.0,
+    loads: tuple[Load, ...] = (),
+    colliders: tuple[Collider, ...] = (),
     device: str = "cpu",
     **settings: Any,
 ) -> Model:
@@ -117,6 +121,8 @@ def make_model(
         law=None if law is None else np.full(elements, LAWS.index(law), np.int32),
         yield_stress=None if yield_stress is None else each(yield_stress, elements),
         hardening=None if yield_stress is None else each(hardening, elements),
+        loads=loads,
+        colliders=colliders,
     )
 
 
