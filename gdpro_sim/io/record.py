@@ -327,27 +327,23 @@ def _fingerprint(scene: Scene, device: str) -> str:
     """Hash of what decides the frames: scene, files (and those of the same stem), device, versions."""
     versions = f"{gdpro_sim.__version__} {RESUME_FORMAT} {wp.config.version}"
     digest = hashlib.sha256(f"{versions}\n{device}\n{scene.model_dump_json()}".encode())
-    for body in scene.bodies:
-        for reference in (body.asset, body.texture):
-            if reference is not None:
-                path = scene.resolve(reference)
-                beside = path.parent.glob(f"{glob.escape(path.stem)}.*")  # .mtl, textures, buffers
-                for file in sorted({path, *beside}):
-                    if file.is_file():
-                        digest.update(sha256_of(file).encode())
+    for reference in scene.files:
+        path = scene.resolve(reference)
+        beside = path.parent.glob(f"{glob.escape(path.stem)}.*")  # .mtl, textures, buffers
+        for file in sorted({path, *beside}):
+            if file.is_file():
+                digest.update(sha256_of(file).encode())
     return digest.hexdigest()
 
 
 def _keep_inputs(scene: Scene, outputs: list[Path]) -> None:
     """Raise RequestError where a result would be written over a file the scene reads."""
     written = {os.path.realpath(path) for path in outputs}
-    for body in scene.bodies:
-        for reference in (body.asset, body.texture):
-            if reference is not None and os.path.realpath(scene.resolve(reference)) in written:
-                raise RequestError(
-                    f"the results would overwrite {scene.resolve(reference)}, which the scene reads; "
-                    f"choose another output folder"
-                )
+    for path in map(scene.resolve, scene.files):
+        if os.path.realpath(path) in written:
+            raise RequestError(
+                f"the results would overwrite {path}, which the scene reads; choose another output folder"
+            )
 
 
 class _Store:

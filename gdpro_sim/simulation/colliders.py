@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +16,8 @@ from gdpro_sim.meshing.load import load_mesh
 from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.repair import face_normals, validate
 from gdpro_sim.simulation.conditions import Motion
-from gdpro_sim.simulation.forces import Keyframe, several
-from gdpro_sim.simulation.options import Number, Options, Vector
+from gdpro_sim.simulation.motions import Moving
+from gdpro_sim.simulation.options import Number, Vector
 
 ROOM = 0.9
 """Share of half an obstacle's thickness that a vertex may sink into."""
@@ -31,7 +30,7 @@ Length = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Kind = Literal["plane", "box", "sphere", "capsule", "cylinder", "mesh"]
 
 
-class ColliderBase(Options):
+class ColliderBase(Moving):
     """What all colliders share."""
 
     name: str = Field(default="", description="for messages; default: its kind")
@@ -43,30 +42,6 @@ class ColliderBase(Options):
         le=10.0,
         description="Coulomb coefficient; combines with a body's by the geometric mean; default: the body's",
     )
-    motion: tuple[Keyframe, ...] = Field(
-        default=(), description="keyframes in order of time from where it stands at 0, linear in between"
-    )
-    pivot: Vector | None = Field(
-        default=None, description="m, a point of the axis that keyframes turn about; default: position"
-    )
-
-    @field_validator("motion", mode="before")
-    @classmethod
-    def _several(cls, value: Any) -> Any:
-        return several(value)
-
-    @field_validator("motion")
-    @classmethod
-    def _in_order(cls, value: tuple[Keyframe, ...]) -> tuple[Keyframe, ...]:
-        for before, after in itertools.pairwise(value):
-            if after.time <= before.time:
-                raise ValueError(
-                    f"keyframes must be in order of time, got {before.time:g} s, {after.time:g} s"
-                )
-        first = value[0] if value else None
-        if first is not None and first.time == 0.0 and (any(first.translation) or any(first.rotation)):
-            raise ValueError("the keyframe at time 0 must have no translation and rotation; use `position`")
-        return value
 
 
 class PlaneCollider(ColliderBase):
@@ -192,7 +167,7 @@ def compile_collider(options: ColliderOptions, resolve: Callable[[str], Path] = 
         "position": np.asarray(options.position, np.float64),
         "rotation": rotation,
         "friction": options.friction,
-        "motion": _motion(options),
+        "motion": options.compiled(np.asarray(options.position)) if options.motion else None,
     }
     if isinstance(options, PlaneCollider):
         common["rotation"] = rotation @ _turned_to(np.asarray(options.normal))
@@ -268,21 +243,6 @@ def _terrain(heights: np.ndarray, size: tuple[float, float]) -> tuple[np.ndarray
     walls = [np.stack([rim, rim + count, after], 1), np.stack([after, rim + count, after + count], 1)]
     faces = np.concatenate([up, up[:, ::-1] + count, *walls])
     return np.concatenate([top, bottom]), faces.astype(np.int32)
-
-
-def _motion(options: ColliderBase) -> Motion | None:
-    if not options.motion:
-        return None
-    keys = [(k.time, k.translation, k.rotation) for k in options.motion]
-    if keys[0][0] > 0.0:
-        keys.insert(0, (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    return Motion(
-        vertices=np.zeros(0, np.int32),
-        pivot=np.asarray(options.position if options.pivot is None else options.pivot, np.float64),
-        times=np.array([time for time, _, _ in keys]),
-        translations=np.array([shift for _, shift, _ in keys], np.float64),
-        rotations=np.radians([turn for _, _, turn in keys]),
-    )
 
 
 def _turned_to(normal: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from gdpro_sim.asset import Asset, import_mesh, kind, tetrahedralize_asset
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
+from gdpro_sim.simulation.colliders import MeshCollider, compile_collider
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
 from gdpro_sim.simulation.model import Body, FemSettings, Ground, Model
 from gdpro_sim.simulation.scene import Scene, SceneBody
@@ -34,6 +35,10 @@ def check_files(scene: Scene) -> None:
             if reference is not None and not scene.resolve(reference).exists():
                 path = scene.resolve(reference)
                 raise SceneError(f"{scene.name}: bodies[{body.name}].{key}: {path}: no such file")
+    for k, collider in enumerate(scene.colliders):
+        if isinstance(collider, MeshCollider) and not scene.resolve(collider.file).exists():
+            path = scene.resolve(collider.file)
+            raise SceneError(f"{scene.name}: colliders[{k}].file: {path}: no such file")
 
 
 def load_assets(
@@ -159,6 +164,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         pinned=np.zeros(vertex_begin, bool),
         gravity=scene.gravity,
         ground=None if scene.ground is None else Ground(scene.ground.height),
+        colliders=tuple(compile_collider(options, scene.resolve) for options in scene.colliders),
         fem=FemSettings(**{k: v for k, v in options.model_dump().items() if k != "kind"}),
         device=device,
     )

@@ -119,7 +119,7 @@ def _pins(body: SceneBody, item: _Placed, pinned: np.ndarray, release: np.ndarra
         if pin.release is not None:
             release[item.first + ids] = pin.release
         if pin.motion and len(ids):
-            yield _motion(pin, item.points[chosen[k]].mean(axis=0), item.first + ids)
+            yield pin.compiled(item.points[chosen[k]].mean(axis=0), item.first + ids)
 
 
 def _agree(a: Pin, a_ids: np.ndarray, b: Pin, b_ids: np.ndarray) -> bool:
@@ -127,19 +127,6 @@ def _agree(a: Pin, a_ids: np.ndarray, b: Pin, b_ids: np.ndarray) -> bool:
         return False
     turns = a.pivot is None and any(any(key.rotation) for key in a.motion)
     return not turns or np.array_equal(a_ids, b_ids)
-
-
-def _motion(pin: Pin, middle: np.ndarray, ids: np.ndarray) -> Motion:
-    keys = [(key.time, key.translation, key.rotation) for key in pin.motion]
-    if keys[0][0] > 0.0:
-        keys.insert(0, (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-    return Motion(
-        vertices=ids.astype(np.int32),
-        pivot=middle if pin.pivot is None else np.asarray(pin.pivot),
-        times=np.array([time for time, _, _ in keys]),
-        translations=np.array([shift for _, shift, _ in keys]),
-        rotations=np.radians([turn for _, _, turn in keys]),
-    )
 
 
 def _loads(body: SceneBody, item: _Placed, model: Model) -> Iterator[Load]:

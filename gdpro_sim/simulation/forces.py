@@ -2,64 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
-from typing import Any
+from pydantic import Field, model_validator
 
-from pydantic import Field, field_validator, model_validator
-
+from gdpro_sim.simulation.motions import Moving
 from gdpro_sim.simulation.options import Options, Vector
 from gdpro_sim.simulation.regions import Region
 
 
-def several(value: Any) -> Any:
-    """One entry may stand without its list."""
-    return [value] if isinstance(value, dict | Options) else value
-
-
-class Keyframe(Options):
-    """Where moving pins are at a time."""
-
-    time: float = Field(ge=0.0, description="s")
-    translation: Vector = Field(default=(0.0, 0.0, 0.0), description="m, from where they start")
-    rotation: Vector = Field(
-        default=(0.0, 0.0, 0.0),
-        description="degrees about `pivot`: a rotation vector, its direction the axis, its length the angle",
-    )
-
-
-class Pin(Region):
+class Pin(Region, Moving):
     """Vertices that are held: where they start, or where keyframes take them."""
 
-    motion: tuple[Keyframe, ...] = Field(
-        default=(),
-        description="keyframes in order of time, linear in between; from rest at time 0, at rest after the "
-        "last; between two rotations about one axis by the angle (full turns count), else the shortest way",
-    )
-    pivot: Vector | None = Field(
-        default=None,
-        description="m, a point of the axis of rotation; default: the middle of the pinned vertices",
-    )
     release: float | None = Field(default=None, gt=0.0, description="s, when they are let go; default: never")
-
-    @field_validator("motion", mode="before")
-    @classmethod
-    def _several(cls, value: Any) -> Any:
-        return several(value)
-
-    @field_validator("motion")
-    @classmethod
-    def _in_order(cls, value: tuple[Keyframe, ...]) -> tuple[Keyframe, ...]:
-        for before, after in itertools.pairwise(value):
-            if after.time <= before.time:
-                raise ValueError(
-                    f"keyframes must be in order of time, got {before.time:g} s, {after.time:g} s"
-                )
-        first = value[0] if value else None
-        if first is not None and first.time == 0.0 and (any(first.translation) or any(first.rotation)):
-            raise ValueError(
-                "the keyframe at time 0 must have no translation and rotation; move the body there"
-            )
-        return value
 
     @model_validator(mode="after")
     def _something(self) -> Pin:
@@ -67,8 +20,6 @@ class Pin(Region):
             raise ValueError(
                 "give a box (minimum, maximum), a sphere (center, radius), a side or vertices to pin"
             )
-        if self.pivot is not None and not self.motion:
-            raise ValueError("`pivot` belongs to a `motion`")
         return self
 
 
@@ -198,11 +149,9 @@ __all__ = [
     "AirFlow",
     "Attachment",
     "ConstantForce",
-    "Keyframe",
     "Pin",
     "Push",
     "Spring",
     "SpringEnd",
     "SurfacePressure",
-    "several",
 ]

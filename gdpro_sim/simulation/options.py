@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -16,4 +16,9 @@ class Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-__all__ = ["Number", "Options", "Vector"]
+def several(value: Any) -> Any:
+    """For validators of lists: one entry may stand without its list."""
+    return [value] if isinstance(value, dict | Options) else value
+
+
+__all__ = ["Number", "Options", "Vector", "several"]

@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
+from gdpro_sim.simulation.colliders import ColliderOptions, MeshCollider
 from gdpro_sim.simulation.forces import (
     AirFlow,
     Attachment,
@@ -23,10 +24,9 @@ from gdpro_sim.simulation.forces import (
     Push,
     Spring,
     SurfacePressure,
-    several,
 )
 from gdpro_sim.simulation.model import FemSettings, Integrator
-from gdpro_sim.simulation.options import Options, Vector
+from gdpro_sim.simulation.options import Options, Vector, several
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +163,7 @@ class SolverOptions(Options):
     )
     volumes: Literal["auto", "nodal", "element"] = Field(
         default="auto",
-        description="volume changes averaged around vertices (nodal), per element, or by Poisson's ratio (auto)",
+        description="volume changes: averaged around vertices, per element, or by Poisson ratio",
     )
     contact_gap: float = Field(
         default=FemSettings.contact_gap,
@@ -193,6 +193,9 @@ class Scene(Options):
     camera: Camera = Field(default_factory=Camera)
     render: Render = Field(default_factory=Render)
     solver: SolverOptions = Field(default_factory=SolverOptions)
+    colliders: tuple[ColliderOptions, ...] = Field(
+        default=(), description="rigid obstacles, at rest or moving; one or several"
+    )
     wind: tuple[AirFlow, ...] = Field(default=(), description="air that drags and lifts; one or several")
     springs: tuple[Spring, ...] = Field(default=(), description="between bodies, or a body and the world")
     attachments: tuple[Attachment, ...] = Field(
@@ -211,7 +214,7 @@ class Scene(Options):
             seen.add(body.name)
         return self
 
-    @field_validator("wind", "springs", "attachments", mode="before")
+    @field_validator("colliders", "wind", "springs", "attachments", mode="before")
     @classmethod
     def _several(cls, value: Any) -> Any:
         return () if value is None else several(value)
@@ -248,6 +251,13 @@ class Scene(Options):
     def frame_count(self) -> int:
         """Frames of the simulation, the initial one included."""
         return max(1, round(self.duration * self.fps)) + 1
+
+    @property
+    def files(self) -> list[str]:
+        """References to every file the scene reads, as they are written in it."""
+        named = [reference for body in self.bodies for reference in (body.asset, body.texture)]
+        named += [collider.file for collider in self.colliders if isinstance(collider, MeshCollider)]
+        return [reference for reference in named if reference]
 
     def resolve(self, reference: str) -> Path:
         """Absolute path of an asset reference. Raises SceneError for an unknown `package:`."""
@@ -390,15 +400,18 @@ def check_scene(data: dict[str, Any], source: str = "scene") -> Scene:
 def _explain(item: Any, source: str) -> str:
     """One line for one pydantic error: file, path of the key, what was expected, what was given."""
     location = item["loc"]
-    place = ""
-    for part in location:
-        place += f"[{part}]" if isinstance(part, int) else (f".{part}" if place else str(part))
+    place, _ = _place(location)
     value = item.get("input")
     if item["type"] == "extra_forbidden":
-        allowed = _fields_at(location[:-1])
+        _, allowed = _place(location[:-1])
         near = difflib.get_close_matches(str(location[-1]), allowed, n=1)
         hint = f" (did you mean `{near[0]}`?)" if near else ""
         return f"{source}: {place}: unknown key{hint}; allowed: {', '.join(allowed)}"
+    if item["type"] == "union_tag_not_found":
+        return f"{source}: {place}.kind: is required"
+    if item["type"] == "union_tag_invalid":
+        expected, tag = item["ctx"]["expected_tags"], item["ctx"]["tag"]
+        return f"{source}: {place}.kind: must be {expected}, got {tag!r}"
     if item["type"] == "missing":
         return f"{source}: {place}: is required"
     if item["type"] == "too_short":
@@ -411,26 +424,32 @@ def _explain(item: Any, source: str) -> str:
     return f"{source}: {place or 'scene'}: {message}{shown}"
 
 
-def _fields_at(location: tuple[Any, ...]) -> list[str]:
-    """Field names of the model that lives at a path inside Scene."""
-    model: type[BaseModel] = Scene
+def _place(location: tuple[Any, ...]) -> tuple[str, list[str]]:
+    """A path inside Scene as the user writes it, and the field names of the model that lives there.
+
+    The path of pydantic also names which of several kinds of thing was meant; the user wrote no such key.
+    """
+    models: list[type[BaseModel]] = [Scene]
+    place = ""
     for part in location:
-        if isinstance(part, int) or part not in model.model_fields:
+        if isinstance(part, int):
+            place += f"[{part}]"
             continue
-        found = _model_in(model.model_fields[part].annotation)
-        if found is not None:
-            model = found
-    return [name for name in model.model_fields if name != "folder"]
+        kinds = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == part]
+        if kinds and len(models) > 1:
+            models = kinds
+            continue
+        place += f".{part}" if place else str(part)
+        owners = [model for model in models if part in model.model_fields]
+        found = _models_in(owners[0].model_fields[part].annotation) if owners else []
+        models = found or models
+    return place, [name for name in models[0].model_fields if name != "folder"]
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for inner in get_args(annotation):
-        found = _model_in(inner)
-        if found is not None:
-            return found
-    return None
+        return [annotation]
+    return [model for inner in get_args(annotation) for model in _models_in(inner)]
 
 
 __all__ = [

@@ -13,7 +13,7 @@ from gdpro_sim.asset import Asset, import_mesh, tetrahedralize_asset
 from gdpro_sim.cli import main
 from gdpro_sim.errors import AssetError, SceneError
 from gdpro_sim.materials import LAWS
-from gdpro_sim.simulation.compile import compile_scene
+from gdpro_sim.simulation.compile import check_files, compile_scene
 from gdpro_sim.simulation.conditions import Force, Impulse, Pressure, Wind
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.model import Model
@@ -240,6 +240,31 @@ def test_wind_blows_on_the_named_bodies(ball: Asset) -> None:
     assert isinstance(both, Wind) and isinstance(upper, Wind)
     assert len(both.faces) == 2 * len(upper.faces)
     assert upper.faces.min() >= model.bodies[1].vertex_range[0]
+
+
+def test_colliders_are_compiled(ball: Asset, tmp_path: Path) -> None:
+    """A ball that comes to rest in a bowl made of a tilted box and a mesh, and one that is pushed."""
+    trimesh.creation.box((1.0, 1.0, 0.1)).export(tmp_path / "plate.ply")
+    plate = {"kind": "mesh", "file": "plate.ply", "position": [0, 0, 0.1], "up": "z"}
+    ram = {
+        "kind": "box",
+        "size": [0.1, 0.5, 0.5],
+        "position": [-0.2, 0, 0.3],
+        "motion": {"time": 0.5, "translation": [0.2, 0, 0]},
+    }
+    body = {"name": "ball", "asset": "ball.usdc", "position": [0, 0, 0.16], "material": "rubber"}
+    data = {"bodies": [body], "colliders": [plate, ram], "folder": tmp_path}
+    model = compile_scene(check_scene(data), {"ball": ball})
+    assert [collider.kind for collider in model.colliders] == ["mesh", "box"]
+    solver = SolverFEM(model)
+    for _ in range(30):
+        solver.step(1 / 60)
+    surface = solver.surface_positions(0)
+    assert surface[:, 0].min() == pytest.approx(0.05, abs=0.05), "pushed aside"
+    assert surface[:, 2].min() == pytest.approx(0.15, abs=0.01), "carried by the plate"
+    missing = check_scene({**data, "colliders": {**plate, "file": "none.ply"}})
+    with pytest.raises(SceneError, match=r"colliders\[0\].file: .*none.ply: no such file"):
+        check_files(missing.model_copy(update={"bodies": ()}))
 
 
 def test_laws_and_yield_stress_are_compiled(ball: Asset) -> None:

@@ -14,13 +14,13 @@ from gdpro_sim.simulation.forces import (
     AirFlow,
     Attachment,
     ConstantForce,
-    Keyframe,
     Pin,
     Push,
     Spring,
     SpringEnd,
     SurfacePressure,
 )
+from gdpro_sim.simulation.motions import Keyframe
 from gdpro_sim.simulation.scene import Scene, SceneBody, check_scene, load_scene, scene_names
 
 MINIMAL = "bodies:\n  - asset: thing.obj\n"
@@ -146,6 +146,17 @@ def test_defaults_and_relative_paths(tmp_path: Path) -> None:
             r"bodies\[thing\].impulses: have no effect without inertia",
         ),
         (MINIMAL + "solver: {contact_gap: 0}", "contact_gap: must be greater than 0"),
+        (MINIMAL + "colliders: {radius: 1}", r"colliders\[0\].kind: is required"),
+        (MINIMAL + "colliders: {kind: cube}", r"colliders\[0\].kind: must be 'plane', 'box', .*, got 'cube'"),
+        (MINIMAL + "colliders: {kind: sphere}", r"colliders\[0\].radius: is required"),
+        (
+            MINIMAL + "colliders: [{kind: plane}, {kind: sphere, radius: 1, radios: 1}]",
+            r"colliders\[1\].radios: unknown key \(did you mean `radius`\?\)",
+        ),
+        (
+            MINIMAL + "colliders: {kind: plane, motion: {time: 0, rotation: [0, 1, 0]}}",
+            r"colliders\[0\].motion: the keyframe at time 0 must have no",
+        ),
     ],
 )
 def test_wrong_scenes_are_refused(tmp_path: Path, text: str, expected: str) -> None:
