@@ -1,15 +1,19 @@
 """FEM speed: milliseconds per frame of a 0.5 m box dropped 0.3 m, over mesh size and Young's modulus.
 
-    python -m tests.benchmarks.bench_fem [--frames 60] [--threads N] [--device cpu] [--cells 9 15]
+    python -m tests.benchmarks.bench_fem [--frames 60] [--threads N] [--device cpu] [--cells 9 15] [--shares]
 
 Prints a Markdown table and the machine it was made on. 60 frames/s, density 1000, poisson 0.4, friction 0.5,
-no damping, default solver settings. The first step (compilation) is not counted.
+no damping, default solver settings. The first step (compilation) is not counted. "CPU" is the time of
+all threads together: on a shared machine it differs less from run to run than wall time. `--shares` says
+where the wall time of a frame goes.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections import defaultdict
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,28 +24,78 @@ from gdpro_sim.simulation.model import Ground
 from tests.benchmarks.machine import machine
 from tests.simulation.fem_models import make_model, tet_box
 
+PARTS = ("assembly", "solve", "energy", "contact", "other")
 
-def measure(cells: int, young: float, frames: int, device: str) -> str:
+
+class Shares:
+    """Wall time by part of a solver's step; what a part calls of another counts there alone."""
+
+    def __init__(self, solver: SolverFEM, device: str) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._part, self._since, self._device = "other", time.perf_counter(), device
+        potential = solver._potential
+        self._watch(potential, "linearise", "assembly")
+        self._watch(potential.system, "solve", "solve")
+        self._watch(solver._rigid, "correct", "solve")
+        self._watch(potential, "energy", "energy")
+        for term in solver.terms:
+            for name in ("lag", "energy", "add_derivatives", "largest_step", "finish"):
+                self._watch(term, name, "contact")
+
+    def _watch(self, owner: Any, name: str, part: str) -> None:
+        original = getattr(owner, name)
+
+        def timed(*inputs: Any, **options: Any) -> Any:
+            before = self.switch(part)
+            try:
+                return original(*inputs, **options)
+            finally:
+                self.switch(before)
+
+        setattr(owner, name, timed)
+
+    def switch(self, part: str) -> str:
+        """Count on for `part`; the part counted for until now."""
+        wp.synchronize_device(self._device)
+        now, before = time.perf_counter(), self._part
+        self.seconds[before] += now - self._since
+        self._part, self._since = part, now
+        return before
+
+
+def measure(cells: int, young: float, frames: int, device: str, shares: bool) -> str:
     """One row of the table."""
     vertices, tets = tet_box((cells,) * 3, (0.5,) * 3, (0.0, 0.0, 0.3))
     solver = SolverFEM(make_model(vertices, tets, young=young, poisson=0.4, ground=Ground(), device=device))
     solver.step(1 / 60)
     solver.reset()
+    watch = Shares(solver, device) if shares else None
     times, newton, cg, substeps, unconverged = [], 0, 0, 0, 0
+    processor = time.process_time()
     for _ in range(frames):
         begin = time.perf_counter()
+        if watch:
+            watch.switch("other")
         solver.step(1 / 60)
         wp.synchronize_device(device)
         times.append(1e3 * (time.perf_counter() - begin))
-        d = solver.diagnostics()
-        newton += d.newton_iterations
-        cg += d.cg_iterations
-        substeps += d.substeps
-        unconverged += not d.converged
-    return (
-        f"| {len(tets):,} | {young:.0e} | {np.mean(times):.0f} | {np.median(times):.0f} | {max(times):.0f} "
-        f"| {substeps / frames:.2f} | {newton / frames:.1f} | {cg / max(newton, 1):.0f} | {unconverged} |"
+        if watch:
+            watch.switch("between frames")
+        c = solver._counters
+        newton += c.newton_iterations
+        cg += c.cg_iterations
+        substeps += c.substeps
+        unconverged += not c.converged
+    processor = 1e3 * (time.process_time() - processor) / frames
+    row = (
+        f"| {len(tets):,} | {young:.0e} | {np.mean(times):.1f} | {np.median(times):.1f} | {max(times):.0f} "
+        f"| {processor:.1f} | {substeps / frames:.2f} | {newton / frames:.1f} | {cg / max(newton, 1):.0f} "
+        f"| {unconverged} |"
     )
+    if watch:
+        whole = sum(watch.seconds[part] for part in PARTS)
+        row += "".join(f" {100 * watch.seconds[part] / whole:.0f} % |" for part in PARTS)
+    return row
 
 
 def main() -> None:
@@ -53,20 +107,20 @@ def main() -> None:
     parser.add_argument("--young", type=float, nargs="+", default=[1e4, 1e5, 1e6, 1e7])
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--shares", action="store_true", help="add where the time goes")
     options = parser.parse_args()
     if options.threads:
         devices.set_thread_count(options.threads)
     device = devices.resolve_device(options.device)
 
     print(f"{machine(device)}\n")
-    print(
-        "| tets | E, Pa | ms/frame mean | median | worst "
-        "| substeps | Newton/frame | CG/Newton | unconverged |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
+    columns = ["tets", "E, Pa", "ms/frame mean", "median", "worst", "CPU", "substeps", "Newton/frame"]
+    columns += ["CG/Newton", "unconverged", *(PARTS if options.shares else ())]
+    print(f"| {' | '.join(columns)} |")
+    print("|---" * len(columns) + "|")
     for cells in options.cells:
         for young in options.young:
-            print(measure(cells, young, options.frames, device), flush=True)
+            print(measure(cells, young, options.frames, device, options.shares), flush=True)
 
 
 if __name__ == "__main__":

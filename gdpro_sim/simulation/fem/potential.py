@@ -169,7 +169,7 @@ class IncrementalPotential:
             self._groups,
             [self._lanes, self.element_count, self.elements, x, self._cauchy_green, inverse_h],
             [self._work, self._energies],
-            minimum=64,
+            minimum=512,
         )
 
     def linearise(self, x: wp.array, *, exact: bool = False) -> None:
