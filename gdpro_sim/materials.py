@@ -47,7 +47,7 @@ PRESETS: dict[str, dict[str, float]] = {
     "plush": _values(2.0e4, 0.25, 50.0, 0.7, 5.0e-3),
     # ---- that keeps its dents ----
     # Plasticine flows at about 0.1 MPa at room temperature; orders of magnitude.
-    "plasticine": _values(2.0e6, 0.45, 1800.0, 0.7, 1.0e-3, yield_stress=1.0e5),
+    "plasticine": _values(2.0e6, 0.45, 1800.0, 0.7, 1.0e-4, yield_stress=1.0e5),
     # ---- wood, paper, leather ----
     # Douglas fir (interior south) along the grain at 12 % moisture, taken as isotropic: 10.3 GPa, specific
     # gravity 0.46, Poisson ratios 0.29 and 0.45 (Wood Handbook, USDA FPL-GTR-282, ch. 5).

@@ -15,7 +15,7 @@ from gdpro_sim.materials import LAWS, PRESETS, Material
 from gdpro_sim.simulation.conditions import Force
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.fem.rest import rest_shapes
-from gdpro_sim.simulation.model import Model
+from gdpro_sim.simulation.model import Ground, Model
 from tests.reference import elasticity as reference
 from tests.simulation.element_batch import LAM, MU, YOUNG, Batch, random_rotation, with_stretches
 from tests.simulation.fem_models import make_model, tet_box
@@ -238,6 +238,38 @@ def test_thrown_bar_stays_bent_and_loses_energy(integrator: str) -> None:
     assert energies[-1] < 0.7 * energies[0]
     slack = 0.02 if integrator in ("midpoint", "explicit") else 1e-9
     assert np.diff(energies).max() <= slack * energies[0]
+
+
+def test_plasticine_thrown_at_the_ground_stays_flat() -> None:
+    material = Material.model_validate("plasticine")
+    assert material.yield_stress is not None
+    vertices, tets = tet_box((4, 4, 4), (0.2, 0.2, 0.2))
+    model = make_model(
+        vertices,
+        tets,
+        young=material.young,
+        poisson=material.poisson,
+        density=material.density,
+        rayleigh_stiffness=material.rayleigh_stiffness,
+        velocities=np.tile([0.0, 0.0, -15.0], (len(vertices), 1)),
+        ground=Ground(0.0),
+    )
+    count = len(tets)
+    solver = SolverFEM(
+        dataclasses.replace(
+            model,
+            law=np.full(count, material.law, np.int32),
+            yield_stress=np.full(count, material.yield_stress),
+        )
+    )
+    for _ in range(40):
+        solver.step(1 / 300)
+        assert solver.diagnostics().converged
+    width, depth, height = np.ptp(solver.positions, axis=0)
+    assert height < 0.85 * 0.2 and min(width, depth) > 1.1 * 0.2
+    assert solver.diagnostics().kinetic_energy < 0.01 * (0.5 * material.density * 0.2**3 * 15.0**2)
+    edges = solver.positions[tets[:, 1:]] - solver.positions[tets[:, :1]]
+    assert np.linalg.det(edges).sum() / 6.0 == pytest.approx(0.2**3, rel=0.02)
 
 
 def test_plastic_state_is_saved_restored_and_reset() -> None:
