@@ -92,12 +92,14 @@ class Batch:
         p._evaluate_elements(array, inverse_dt)
         return p._energies.numpy()[: len(x)].copy()
 
-    def derivatives(self, x: np.ndarray, inverse_dt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient [T, 4, 3] and Hessian [T, 12, 12]."""
+    def derivatives(
+        self, x: np.ndarray, inverse_dt: float = 0.0, *, exact: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient [T, 4, 3] and Hessian [T, 12, 12], projected unless `exact`."""
         p = self.potential
         array = wp.array(x.reshape(-1, 3), dtype=wp.vec3d, device="cpu")
         p._inverse_h = inverse_dt
-        p.differentiate_elements(array)
+        p.differentiate_elements(array, exact=exact)
         blocks = p._element_blocks.numpy().reshape(-1, 10, 3, 3)
         full = np.zeros((len(x), 4, 3, 4, 3))
         for slot, (a, b) in enumerate(itertools.combinations_with_replacement(range(4), 2)):
