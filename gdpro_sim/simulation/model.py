@@ -68,7 +68,7 @@ class FemSettings:
 
     integrator: Integrator = "backward-euler"
     substeps: int = 2
-    newton_iterations: int = 20
+    newton_iterations: int = 60
     newton_tolerance: float = 1e-3
     cg_iterations: int = 2000
     cg_tolerance: float = 1e-2

@@ -34,6 +34,10 @@ MAX_HALVINGS = 30
 MAX_SPLITS = 4
 """A substep that fails is halved at most this many times."""
 
+LAGGED = 10
+"""Newton iterations that take friction limits and contact candidates anew; the later ones keep them, so that
+they descend on one fixed energy."""
+
 NEGLIGIBLE = 0.01
 """A residual that inertia alone would undo within this share of the tolerance counts as solved."""
 
@@ -302,7 +306,7 @@ class SolverFEM:
             wp.copy(potential.start, potential.trial)
             # Lagged values follow the iterate, then stay, so that the late iterations descend on one fixed
             # energy.
-            if iteration <= settings.newton_iterations // 2:
+            if iteration <= LAGGED:
                 potential.lag(potential.start)
                 energy = potential.energy(potential.start, elements_unchanged=True)
             potential.linearise(potential.start, exact=exact)
