@@ -47,7 +47,7 @@ class Term(Protocol):
     def lag(self, x: wp.array) -> None:
         """Take from x what is held fixed for a while: friction limits, contact candidates.
 
-        Called at the start and before Newton iterations of the first half; the energy may jump.
+        Called at the start and before the first Newton iterations of a solve; the energy may jump.
         """
 
     def energy(self, x: wp.array, energies: wp.array, first: int) -> None:
