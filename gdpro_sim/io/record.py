@@ -38,6 +38,7 @@ from gdpro_sim.io.images import (
     write_png,
     write_video,
 )
+from gdpro_sim.io.obstacles import Obstacles, with_obstacles
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.usd import SimulationWriter, body_records
 from gdpro_sim.simulation.compile import check_files, load_assets
@@ -130,7 +131,8 @@ def record(
     studio = _studio(checked, simulation)
     renderer = Renderer(frame_camera(low, high, **checked.camera.model_dump()), studio)
     preview = {"low": low.tolist(), "high": high.tolist(), "studio": asdict(studio)}
-    rows = _run(simulation, folder, store, renderer, preview, report)
+    obstacles = Obstacles(simulation.model.colliders, low, high, device)
+    rows = _run(simulation, folder, store, renderer, obstacles, preview, report)
 
     begin = time.perf_counter()
     pictures = [frames / frame_name(i) for i in range(len(simulation))]
@@ -166,6 +168,7 @@ def _run(
     folder: Path,
     store: _Store,
     renderer: Renderer,
+    obstacles: Obstacles,
     preview: dict[str, Any],
     report: Progress,
 ) -> list[dict[str, Any]]:
@@ -202,7 +205,8 @@ def _run(
             path = folder / "frames" / frame_name(index)
             picture = None
             if stored is None or not path.exists():
-                picture = renderer.render(frame.gaussians(), _normals(simulation, frame))
+                shown = obstacles.added_to(frame.gaussians(), _normals(simulation, frame), frame.time)
+                picture = renderer.render(*shown)
             drawn = time.perf_counter()
             if picture is not None:
                 write_png(path, picture)
@@ -275,6 +279,7 @@ def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray
         for shift in _path(scene, body, low, float((high - low).max()), friction):
             boxes.append((low + shift, high + shift))
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    low, high = with_obstacles(simulation.model.colliders, low, high)
     if scene.ground is not None:
         low[2] = min(low[2], scene.ground.height)
         spread_out = 0.12 * (high[:2] - low[:2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,19 @@ import torch
 
 from gdpro_sim.asset import Asset, kind
 from gdpro_sim.device import resolve_device, serial_torch
-from gdpro_sim.errors import RequestError
+from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.files import prepare_folder, remove_stale
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.images import frame_name, remove_frames_from, write_png
+from gdpro_sim.io.obstacles import Obstacles
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.turntable import studio_around, turntable_cameras
 from gdpro_sim.io.usd import SimulationReader
+from gdpro_sim.simulation.colliders import compile_collider
 from gdpro_sim.simulation.frame import Frame
-from gdpro_sim.simulation.scene import Camera
+from gdpro_sim.simulation.scene import Camera, Scene
+
+logger = logging.getLogger(__name__)
 
 
 @serial_torch()
@@ -68,12 +73,14 @@ def render_file(
         return written
     reader = SimulationReader(path)
     renderer = _recorded(reader, camera or {}, shading, background)
+    obstacles = _obstacles(reader, name)
     bodies = [body.gaussians.to(name) for body in reader.bodies]
     for frame in reader:
         normals = torch.cat(
             [b.normals(torch.from_numpy(f.vertices)) for b, f in zip(bodies, frame.bodies, strict=True)]
         )
-        write(renderer.render(frame.gaussians().to(name), normals), len(reader))
+        shown = obstacles.added_to(frame.gaussians().to(name), normals, frame.time)
+        write(renderer.render(*shown), len(reader))
     remove_frames_from(folder, len(reader))
     return written
 
@@ -91,6 +98,20 @@ def _recorded(reader: SimulationReader, camera: dict[str, Any], shading: str, ba
         view["eye"] = None
     studio = Studio(**{**preview["studio"], "shading": shading, "background": background})
     return Renderer(frame_camera(preview["low"], preview["high"], **view), studio)
+
+
+def _obstacles(reader: SimulationReader, device: str) -> Obstacles:
+    """What the bodies of a recorded scene meet; meshes as far as their files are still found."""
+    scene, preview = reader.metadata.get("scene"), reader.metadata.get("preview")
+    if scene is None or preview is None or not scene.get("colliders"):
+        return Obstacles((), np.zeros(3), np.ones(3), device)
+    colliders = []
+    for options in Scene.model_validate(scene).colliders:
+        try:
+            colliders.append(compile_collider(options, lambda file: Path(reader.path).parent / file))
+        except MeshError as error:
+            logger.warning("a collider is not drawn: %s", error)
+    return Obstacles(colliders, np.asarray(preview["low"]), np.asarray(preview["high"]), device)
 
 
 def gaussians_of(file: str | Path, frame: int = 0) -> Gaussians:

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 FOREVER = math.inf
 
@@ -31,6 +32,24 @@ class Motion:
     times: np.ndarray
     translations: np.ndarray
     rotations: np.ndarray
+
+
+def pose_at(motion: Motion, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] and translation [3] m at a time: x = rotation X + translation of what started at X."""
+    times = motion.times
+    k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
+    shift, turn = motion.translations[k], Rotation.from_rotvec(motion.rotations[k])
+    if k + 1 < len(times):
+        share = (time - times[k]) / (times[k + 1] - times[k])
+        shift = (1.0 - share) * shift + share * motion.translations[k + 1]
+        a, b = motion.rotations[k], motion.rotations[k + 1]
+        if np.linalg.norm(np.cross(a, b)) <= 1e-9 * np.linalg.norm(a) * np.linalg.norm(b):
+            turn = Rotation.from_rotvec((1.0 - share) * a + share * b)
+        else:
+            way = (Rotation.from_rotvec(b) * turn.inv()).as_rotvec()
+            turn = Rotation.from_rotvec(share * way) * turn
+    matrix = turn.as_matrix()
+    return matrix, motion.pivot - matrix @ motion.pivot + shift
 
 
 @dataclass(frozen=True)
@@ -98,4 +117,4 @@ class Wind:
 
 Load = Force | Impulse | Pressure | Wind
 
-__all__ = ["FOREVER", "Force", "Impulse", "Load", "Motion", "Pressure", "Springs", "Wind"]
+__all__ = ["FOREVER", "Force", "Impulse", "Load", "Motion", "Pressure", "Springs", "Wind", "pose_at"]

@@ -152,7 +152,7 @@ class SolverOptions(Options):
         description="backward-euler; bdf2 or midpoint, which damp less; quasi-static; explicit",
     )
     substeps: int = Field(default=2, ge=1, le=1000, description="implicit steps per frame at least")
-    newton_iterations: int = Field(default=20, ge=1, le=1000, description="at most, per substep")
+    newton_iterations: int = Field(default=60, ge=1, le=1000, description="at most, per substep")
     newton_tolerance: float = Field(default=1e-3, gt=0.0, description="largest vertex speed correction, m/s")
     cg_iterations: int = Field(default=2000, ge=1, description="at most, per Newton iteration")
     cg_tolerance: float = Field(

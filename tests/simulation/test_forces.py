@@ -11,9 +11,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.meshing.embedding import boundary
-from gdpro_sim.simulation.conditions import Force, Impulse, Load, Motion, Pressure, Springs, Wind
+from gdpro_sim.simulation.conditions import Force, Impulse, Load, Motion, Pressure, Springs, Wind, pose_at
 from gdpro_sim.simulation.fem import SolverFEM
-from gdpro_sim.simulation.fem.forces import force_terms, pose_at
+from gdpro_sim.simulation.fem.forces import force_terms
 from gdpro_sim.simulation.fem.rest import rest_shapes
 from gdpro_sim.simulation.fem.term import Step
 from gdpro_sim.simulation.model import Model

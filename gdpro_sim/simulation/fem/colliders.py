@@ -17,7 +17,7 @@ from gdpro_sim.device import launch_chunked
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import colliders as kernels
 from gdpro_sim.simulation.colliders import Collider
-from gdpro_sim.simulation.fem.forces import pose_at
+from gdpro_sim.simulation.conditions import pose_at
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
 from gdpro_sim.simulation.fem.term import Step
 from gdpro_sim.simulation.model import Model

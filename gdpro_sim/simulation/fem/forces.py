@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from scipy.spatial.transform import Rotation
 
 from gdpro_sim.kernels import forces as kernels
-from gdpro_sim.simulation.conditions import Force, Impulse, Motion, Pressure, Wind
+from gdpro_sim.simulation.conditions import Force, Impulse, Pressure, Wind, pose_at
 from gdpro_sim.simulation.fem.force_term import ForceTerm, integers, share_of_step, vectors
 from gdpro_sim.simulation.fem.rest import RestShapes
 from gdpro_sim.simulation.fem.springs import SpringForces
@@ -65,24 +64,6 @@ class PinMotion(ForceTerm):
         self.launch(kernels.move_pins, self.count, inputs, [step.held])
 
 
-def pose_at(motion: Motion, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3] m at a time: x = rotation X + translation of what started at X."""
-    times = motion.times
-    k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
-    shift, turn = motion.translations[k], Rotation.from_rotvec(motion.rotations[k])
-    if k + 1 < len(times):
-        share = (time - times[k]) / (times[k + 1] - times[k])
-        shift = (1.0 - share) * shift + share * motion.translations[k + 1]
-        a, b = motion.rotations[k], motion.rotations[k + 1]
-        if np.linalg.norm(np.cross(a, b)) <= 1e-9 * np.linalg.norm(a) * np.linalg.norm(b):
-            turn = Rotation.from_rotvec((1.0 - share) * a + share * b)
-        else:
-            way = (Rotation.from_rotvec(b) * turn.inv()).as_rotvec()
-            turn = Rotation.from_rotvec(share * way) * turn
-    matrix = turn.as_matrix()
-    return matrix, motion.pivot - matrix @ motion.pivot + shift
-
-
 class ConstantLoads(ForceTerm):
     """Forces and impulses that depend on time alone. Implements `gdpro_sim.simulation.fem.term.Term`."""
 
@@ -126,4 +107,4 @@ def _share(load: Force | Impulse, step: Step) -> float:
     return 0.0
 
 
-__all__ = ["ConstantLoads", "PinMotion", "force_terms", "pose_at"]
+__all__ = ["ConstantLoads", "PinMotion", "force_terms"]

@@ -1,0 +1,95 @@
+"""Obstacles in pictures: they stand where the solver's do, and every way of drawing a run shows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from gdpro_sim.asset import import_mesh
+from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.io.images import read_png
+from gdpro_sim.io.obstacles import Obstacles, with_obstacles
+from gdpro_sim.io.record import record
+from gdpro_sim.io.views import render_file
+from gdpro_sim.simulation.colliders import Collider, compile_collider
+from gdpro_sim.simulation.scene import check_scene
+
+LOW, HIGH = np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 0.5])
+
+
+def collider(**options: object) -> Collider:
+    scene = check_scene({"bodies": [{"asset": "a.obj"}], "colliders": options})
+    return compile_collider(scene.colliders[0])
+
+
+def drawn(item: Collider, time: float = 0.0) -> np.ndarray:
+    """Means of the Gaussians of one obstacle, [N, 3] m."""
+    none = Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    gaussians, normals = Obstacles([item], LOW, HIGH).added_to(none, torch.zeros(0, 3), time)
+    assert len(gaussians) == len(normals) > 1000
+    return gaussians.means.numpy()
+
+
+@pytest.mark.parametrize(
+    ("options", "half"),
+    [
+        ({"kind": "box", "size": [0.2, 0.4, 0.6]}, [0.1, 0.2, 0.3]),
+        ({"kind": "sphere", "radius": 0.2}, [0.2, 0.2, 0.2]),
+        ({"kind": "capsule", "radius": 0.1, "length": 0.4}, [0.1, 0.1, 0.3]),
+        ({"kind": "cylinder", "radius": 0.1, "length": 0.4}, [0.1, 0.1, 0.2]),
+    ],
+)
+def test_shapes_are_as_large_as_they_are(options: dict[str, object], half: list[float]) -> None:
+    middle = np.array([1.0, 2.0, 3.0])
+    means = drawn(collider(**options, position=middle.tolist()))
+    np.testing.assert_allclose(means.min(0), middle - half, atol=0.012)
+    np.testing.assert_allclose(means.max(0), middle + half, atol=0.012)
+
+
+def test_a_plane_is_drawn_below_its_free_side_where_bodies_are() -> None:
+    means = drawn(collider(kind="plane", position=[0, 0, 0.1], rotation=[0, 30, 0]))
+    height = (means - [0, 0, 0.1]) @ np.array([0.5, 0.0, np.sqrt(0.75)])
+    assert height.max() < 1e-6 and height.min() > -0.05
+    assert np.linalg.norm(means.mean(0) - [0, 0, 0.2]) < 0.2
+
+
+def test_obstacles_move_and_are_kept_in_view() -> None:
+    item = collider(
+        kind="box",
+        size=[0.2, 0.2, 0.2],
+        motion=[{"time": 1, "translation": [2, 0, 0], "rotation": [0, 0, 90]}],
+    )
+    np.testing.assert_allclose(drawn(item, 0.5).mean(0), [1, 0, 0], atol=0.01)
+    low, high = with_obstacles([item], LOW, HIGH)
+    np.testing.assert_allclose(high, [2.1, 0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(low, [-0.5, -0.5, -0.1], atol=1e-6)
+    far_larger = collider(kind="box", size=[50, 50, 1])
+    np.testing.assert_array_equal(with_obstacles([far_larger], LOW, HIGH), (LOW, HIGH))
+
+
+def test_a_recorded_run_shows_its_obstacles_again(tmp_path: Path) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "block.ply")
+    asset = import_mesh(tmp_path / "block.ply", budget=500, target_tets=60)
+    asset.save(tmp_path / "block.usdc")
+    text = (
+        "bodies: [{asset: block.usdc, position: [0, 0, 0.3], material: foam}]\nduration: 0.1\n"
+        "camera: {width: 96, height: 64}\n"
+    )
+    pictures = []
+    for name, more in (
+        ("bare", ""),
+        ("with", "colliders: {kind: sphere, radius: 0.1, position: [0, 0, 0.1]}\n"),
+    ):
+        (tmp_path / f"{name}.yaml").write_text(text + more)
+        run = record(tmp_path / f"{name}.yaml", tmp_path / name)
+        again = render_file(run.simulation, tmp_path / f"{name}_again")
+        assert len(again) == run.frame_count
+        for index, path in enumerate(again):
+            first = read_png(run.frames / path.name).astype(int)
+            assert np.abs(first - read_png(path)).max() <= 2, index
+        pictures.append(first)
+    assert np.abs(pictures[1] - pictures[0]).max() > 50
