@@ -5,9 +5,9 @@
 
 First a cantilever of the same material and element size, swinging under its weight: a peer's iterations are
 raised until where it swings about lies within 2 % of the static solution on the same mesh (our quasi-static
-one). Gravity is scaled so that the tip sinks by 4 % of the length. Then the box of `bench_fem` is dropped with
-those settings. All run on the CPU in this one run, one after the other, on one thread unless --threads says
-otherwise (ours; the peers have one on the CPU). "CPU" is processor time; ratios are of CPU times.
+one). Gravity is scaled so that the tip sinks by 4 % of the length. Then the box of `bench_fem` is dropped
+with those settings. All run on the CPU in this one run, one after the other, on one thread unless --threads
+says otherwise (ours; the peers have one on the CPU). "CPU" is processor time; ratios are of CPU times.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 Needs no package of ours. MESH.npz holds vertices [P, 3] m, tets [T, 4], pinned and tip [P] bool, young,
 poisson, density, gravity (m/s^2, downward), ground (a floor at z = 0); SETTINGS is JSON: frames, substeps,
-iterations. Prints one line of JSON: the mean z, m, of the vertices of `tip` after each frame (1/60 s), and wall
-and processor milliseconds of each frame. A frame is run before, not counted, to compile.
+iterations. Prints one line of JSON: the mean z, m, of the vertices of `tip` after each frame (1/60 s), and
+wall and processor milliseconds of each frame. A frame is run before, not counted, to compile.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def newton_vbd(mesh: dict[str, Any], substeps: int, iterations: int) -> tuple[Ca
     import warp as wp
 
     mu, lam = lame(float(mesh["young"]), float(mesh["poisson"]))
-    builder = newton.ModelBuilder(gravity=-float(mesh["gravity"]))
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -float(mesh["gravity"])))
     builder.add_soft_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
         rot=wp.quat_identity(),
