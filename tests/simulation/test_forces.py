@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from gdpro_sim.device import set_thread_count, thread_count
 from gdpro_sim.meshing.embedding import boundary
 from gdpro_sim.simulation.conditions import Force, Impulse, Load, Motion, Pressure, Springs, Wind, pose_at
 from gdpro_sim.simulation.fem import SolverFEM
@@ -257,6 +258,20 @@ def test_the_period_of_a_mass_on_a_spring(rule: str) -> None:
     assert np.diff(crossings).mean() == pytest.approx(period, rel=5e-3)
 
 
+def test_a_spring_gives_back_what_it_takes() -> None:
+    """Without friction or damping the implicit midpoint rule keeps the energy, the spring's included."""
+    model = hung("midpoint", 400.0, substeps=2)
+    solver = SolverFEM(replace(model, velocities=np.tile(np.float32([0.2, 0.0, 0.0]), (27, 1))))
+    parts = []
+    for _ in range(40):
+        solver.step(1 / 120)
+        d = solver.diagnostics()
+        parts.append((d.kinetic_energy, d.elastic_energy, d.force_energy))
+    totals = np.sum(parts, axis=1)
+    np.testing.assert_allclose(totals, 0.5 * 0.2**2, rtol=2e-3)
+    assert np.max(parts, axis=0)[2] > 0.9 * 0.5 * 0.2**2
+
+
 @pytest.mark.parametrize("rest_length", [0.0, 0.3])
 def test_the_static_stretch_of_a_spring(rest_length: float) -> None:
     """m g / k below where the spring is at rest."""
@@ -461,6 +476,30 @@ def test_all_at_once_continues_to_the_same_bytes(rule: str) -> None:
     for _ in range(12):
         solver.step(1 / 60)
     np.testing.assert_array_equal(solver.positions, first)
+
+
+def test_the_number_of_threads_changes_no_byte() -> None:
+    model = box_model(14, gravity=(0.0, 0.0, -9.81), young=2e4)
+    faces = skin(model)
+    model = replace(model, pinned=model.vertices[:, 2] > 0.49 * SIDE)
+    motion = turning(model, [(0.0, STILL, STILL), (0.1, (0.02, 0.0, 0.0), (0.0, 0.0, 30.0))])
+    loads = (
+        Pressure(faces, -300.0, closed=True),
+        Pressure(faces[:600], 200.0, closed=False),
+        Wind(faces, (4.0, 0.0, 1.0), 1.2, 1.0, 0.5),
+    )
+    springs = spring(at_vertex(0), np.array([-0.1, 0.0, -0.1]), 50.0, 0.05, 0.2)
+    model = replace(model, motions=(motion,), loads=loads, springs=springs)
+    results, before = [], thread_count()
+    try:
+        for threads in (1, 3):
+            set_thread_count(threads)
+            solver = SolverFEM(model)
+            solver.step(1 / 60)
+            results.append(solver.positions)
+    finally:
+        set_thread_count(before)
+    np.testing.assert_array_equal(results[0], results[1])
 
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e7])
