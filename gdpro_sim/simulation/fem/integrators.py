@@ -92,12 +92,15 @@ class ImplicitStep:
             p.hold(self.step.held, array)
 
     def finish(self) -> bool:
-        """Make the trial the new state. False, and nothing done, where the midpoint rule would pass through
-        something or turn an element inside out on the second half of its way."""
+        """Make the trial the new state. False, and nothing done, where the midpoint rule would touch or pass
+        through something, or turn an element inside out, on the second half of its way."""
         p, s, h = self._potential, self._state, self.step.h
         if self.rule == "midpoint":
             p.combine(p.trial, 2.0, s.x, -1.0, p.inertia)
-            if not (p.reachable(p.trial, p.inertia) and np.isfinite(p.elastic_energy(p.inertia))):
+            touching = any(term.report(p.inertia).get("contacts", 0.0) > 0.0 for term in p.terms)
+            if touching or not p.reachable(p.trial, p.inertia):
+                return False
+            if not np.isfinite(p.elastic_energy(p.inertia)):
                 return False
         for term in p.terms:
             term.finish(p.trial)

@@ -107,6 +107,36 @@ def _on_incline(angle: float, tilted: str) -> tuple[SolverFEM, np.ndarray]:
 
 
 @problem(
+    "thrown",
+    title="A box thrown at the ground at 4 m/s, spinning, under each integrator: no energy from nowhere",
+    source="backward Euler never gains; midpoint keeps its own (small ripples); BDF2 stays below its start",
+)
+def thrown() -> Iterator[Check]:
+    vertices, tets = tet_box((3, 3, 3), (0.5,) * 3, (0.0, 0.0, 0.05))
+    velocities = np.cross([2.0, 3.0, 1.0], vertices - vertices.mean(axis=0)) + np.array([1.0, 0.0, -4.0])
+    for rule, step_bound in (("backward-euler", 1e-9), ("midpoint", 1e-4), ("bdf2", None)):
+        for young, poisson in ((1e4, 0.3), (1e6, 0.49)):
+            options: dict[str, Any] = {"young": young, "poisson": poisson, "integrator": rule}
+            solver = SolverFEM(make_model(vertices, tets, velocities=velocities, ground=Ground(), **options))
+            energies, touched, unconverged = [total_energy(solver)], False, 0
+            for _ in range(40):
+                solver.step(1 / 60)
+                energies.append(total_energy(solver))
+                touched |= solver.diagnostics().contacts > 0
+                unconverged += not solver.diagnostics().converged
+            label = f"{rule}, E = {young:g} Pa, nu = {poisson:g}"
+            yield at_least(f"{label}: touched the ground", 1, touched)
+            yield at_most(f"{label}: steps that did not converge", 0, unconverged)
+            if step_bound is None:
+                rise = max(energies) - energies[0]
+                yield at_most(f"{label}: rise above the start / energy", 1e-6, rise / energies[0])
+            else:
+                rise = float(np.diff(energies).max())
+                quantity = f"{label}: largest rise in a step / energy"
+                yield at_most(quantity, step_bound, rise / energies[0])
+
+
+@problem(
     "restitution",
     title="A ball falls by 0.5 m and bounces: the more damping, the lower",
     source="stiffness damping takes energy from every deformation; without any, waves in the ball keep some",
@@ -238,6 +268,6 @@ def stack() -> Iterator[Check]:
         yield at_most(f"{label}: speed left", 1e-3, np.abs(solver.velocities).max(), "m/s")
 
 
-PROBLEMS = (hertz, incline, restitution, collision, stack)
+PROBLEMS = (hertz, incline, thrown, restitution, collision, stack)
 
 __all__ = ["PROBLEMS"]
