@@ -410,6 +410,27 @@ def test_pins_go_where_they_are_told(rule: str) -> None:
     np.testing.assert_allclose(found, end, atol=1e-9)
 
 
+@pytest.mark.parametrize("speed", [0.1, 2.0])
+def test_pins_push_what_rests_on_them(speed: float) -> None:
+    """A body held by all its vertices sets off at once, and takes another with it."""
+    plate, tets = tet_box((2, 2, 2), (SIDE,) * 3)
+    load, _ = tet_box((2, 2, 2), (SIDE,) * 3, (0.0, 0.0, 1.02 * SIDE))
+    count = len(plate)
+    model = make_model(
+        np.concatenate([plate, load]), np.concatenate([tets, tets + count]), young=1e5,
+        pinned=np.arange(2 * count) < count,
+    )  # fmt: skip
+    shifts = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.1 * speed]])
+    motion = Motion(np.arange(count), np.zeros(3), np.array([0.0, 0.1, 0.2]), shifts, np.zeros((3, 3)))
+    solver = SolverFEM(replace(model, motions=(motion,)))
+    for _ in range(12):
+        solver.step(1 / 60)
+        assert solver.diagnostics().converged
+        gap = solver.positions[count:, 2].min() - solver.positions[:count, 2].max()
+        assert gap > 0.0
+    assert solver.velocities[count:, 2].mean() > 0.5 * speed
+
+
 def test_rotations_between_keyframes() -> None:
     model = replace(box_model(1), pinned=np.ones(8, bool))
     about_one = turning(model, [(0.0, STILL, STILL), (2.0, STILL, (0.0, 0.0, 720.0))])

@@ -34,6 +34,10 @@ MAX_HALVINGS = 30
 MAX_SPLITS = 4
 """A substep that fails is halved at most this many times."""
 
+MAX_BLOCKED = 16
+"""The same, where nothing that the solve could start from is possible: moving pins push into something that
+rests, or an element would turn inside out. Once that moves along, it is a start that is."""
+
 LAGGED = 10
 """Newton iterations that take friction limits and contact candidates anew; the later ones keep them, so that
 they descend on one fixed energy."""
@@ -183,7 +187,7 @@ class SolverFEM:
         if rule == "midpoint" and self._touching(self._state.x):
             rule = "backward-euler"
         step, outcome = self._minimise(dt, rule)
-        if not outcome.converged and splits < MAX_SPLITS:
+        if not outcome.converged and splits < (MAX_SPLITS if outcome.finite else MAX_BLOCKED):
             logger.debug("substep of %.3g s failed (%s): halved", dt, outcome)
             self._advance(dt / 2.0, rule, splits + 1)
             self._advance(dt / 2.0, rule, splits + 1)
