@@ -335,6 +335,18 @@ def write_derivatives_group(
     ...
 
 
+@wp.func_native(f"""
+#if !defined(__CUDACC__)
+    const int first = group * {LANES}, lanes = count - first < {LANES} ? count - first : {LANES};
+    const char* const begin = (const char*)(blocks.data + 10 * (size_t)first);
+    for (int i = 0; i < lanes * 720; i += 64) __builtin_prefetch(begin + i, 1);
+#endif
+""")
+def fetch_blocks_group(group: int, count: int, blocks: wp.array[wp.mat33d]):
+    """Fetch the memory that a group's blocks are to be written to, while they are computed."""
+    ...
+
+
 @wp.func
 def read_vector(work: wp.array[wp.float64], at: int, lanes: int, slot: int) -> wp.vec3d:
     """Numbers slot .. slot + 2 of an element; `at` is the place of its number 0."""

@@ -37,6 +37,7 @@ from gdpro_sim.kernels.element_lanes import (
     V_SLOT,
     WORK,
     decompose_group,
+    fetch_blocks_group,
     read_matrix,
     read_vector,
     write_derivatives_group,
@@ -263,6 +264,7 @@ def element_derivatives(
     group = start + wp.tid()
     # A CPU launch goes through its groups one after the other: they can share the first one's work.
     place = wp.where(lanes == 1, group, start)
+    fetch_blocks_group(group, count, blocks_out)
     decompose_group(group, place, count, elements.tets, elements.inverse_rest, x, work_out)
     for e in range(group * lanes, wp.min(count, (group + 1) * lanes)):
         at = place * WORK * lanes + e - group * lanes
