@@ -28,6 +28,13 @@ logger = logging.getLogger(__name__)
 ARMIJO = 1e-4
 """Share of the predicted decrease a step must keep (Nocedal & Wright, 2nd ed., eq. 3.4)."""
 
+STRAIGHT = 0.7
+"""A full step that lowers the energy by more than this share of what its slope promises is lengthened; at the
+minimum of a parabola it is 1/2."""
+
+LONGEST = 8.0
+"""A full step is lengthened by at most this factor."""
+
 MAX_HALVINGS = 30
 """Line search halvings before a Newton iteration is given up."""
 
@@ -385,10 +392,32 @@ class SolverFEM:
             potential.move_trial(length)
             trial = potential.energy(potential.trial)
             if trial <= energy + ARMIJO * length * slope + noise:
+                if length == 1.0 and energy - trial > STRAIGHT * -slope + noise:
+                    trial = self._go_on(energy, slope, trial)
                 return length, trial
             length *= 0.5
         wp.copy(potential.trial, potential.start)
         return 0.0, energy
+
+    def _go_on(self, energy: float, slope: float, trial: float) -> float:
+        """Lengthen a full step along which the energy fell almost as on a straight line; its energy there.
+
+        Projected Hessians are stiffer than the energy where contact or compression takes stiffness away:
+        their steps are too short, and Newton would close in on the minimum by a fixed factor only.
+        """
+        potential = self._potential
+        curvature = trial - energy - slope
+        longer = LONGEST if curvature <= 0.0 else min(-0.5 * slope / curvature, LONGEST)
+        solution = potential.system.solution
+        potential.combine(solution, longer, solution, 0.0, solution)
+        share = potential.largest_step(potential.start, solution)
+        if longer * share > 1.0:
+            potential.move_trial(share)
+            farther = potential.energy(potential.trial)
+            if farther < trial:
+                return farther
+        potential.move_trial(1.0 / longer)
+        return potential.energy(potential.trial)
 
     def surface_positions(self, body: int) -> np.ndarray:
         """Deformed surface vertices of body number `body`, [V, 3] float32 m, world.
