@@ -105,7 +105,7 @@ class SpringEnd(Options):
 class Spring(Options):
     """A spring with a dashpot between two points."""
 
-    ends: tuple[SpringEnd, SpringEnd]
+    ends: tuple[SpringEnd, SpringEnd] = Field(description="the two points, at least one on a body")
     stiffness: float = Field(gt=0.0, description="N/m")
     rest_length: float | None = Field(
         default=None, ge=0.0, description="m; default: as far as the ends are apart at the start"
