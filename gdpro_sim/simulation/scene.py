@@ -421,7 +421,7 @@ def _explain(item: Any, source: str) -> str:
     message = message[0].lower() + message[1:]
     said = "got" in message or (isinstance(value, str) and repr(value) in message)
     shown = "" if said or isinstance(value, dict | list) else f", got {value!r}"
-    return f"{source}: {place or 'scene'}: {message}{shown}"
+    return f"{source}: {place}{': ' if place else ''}{message}{shown}"
 
 
 def _place(location: tuple[Any, ...]) -> tuple[str, list[str]]:
