@@ -212,6 +212,22 @@ def hencky_hessian(s: wp.vec3d, m: Constants):
 
 
 @wp.func
+def linear_energy(F: wp.mat33d, m: Constants) -> wp.float64:
+    e = wp.float64(0.5) * (F + wp.transpose(F)) - wp.identity(n=3, dtype=wp.float64)
+    trace = wp.trace(e)
+    return m.mu * wp.ddot(e, e) + wp.float64(0.5) * m.lam * trace * trace
+
+
+@wp.func
+def neo_hookean_energy(F: wp.mat33d, m: Constants) -> wp.float64:
+    """Of both neo-Hookean laws; infinite where det F <= 0."""
+    J = wp.determinant(F)
+    if J <= wp.float64(0.0):
+        return wp.float64(wp.inf)
+    return wp.float64(0.5) * m.mu * (wp.ddot(F, F) - wp.float64(3.0)) + volumetric_energy(J, m)
+
+
+@wp.func
 def needs_stretches(law: int) -> bool:
     """Whether the energy is a function of the singular values of F."""
     return law == STVK_HENCKY or law == COROTATED
@@ -221,19 +237,16 @@ def needs_stretches(law: int) -> bool:
 def energy_density(F: wp.mat33d, s: wp.vec3d, m: Constants) -> wp.float64:
     """Psi(F), J/m^3; infinite where det F <= 0, but for LINEAR. s are the singular values of F if needed."""
     if m.law == LINEAR:
-        e = wp.float64(0.5) * (F + wp.transpose(F)) - wp.identity(n=3, dtype=wp.float64)
-        trace = wp.trace(e)
-        return m.mu * wp.ddot(e, e) + wp.float64(0.5) * m.lam * trace * trace
+        return linear_energy(F, m)
+    if m.law == STABLE_NEO_HOOKEAN or m.law == NEO_HOOKEAN:
+        return neo_hookean_energy(F, m)
     J = wp.determinant(F)
     if J <= wp.float64(0.0):
         return wp.float64(wp.inf)
     if m.law == STVK_HENCKY:
         return hencky_energy(s, m)
-    if m.law == COROTATED:
-        d = s - wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
-        return m.mu * wp.dot(d, d) + volumetric_energy(J, m)
-    shear = wp.float64(0.5) * m.mu * (wp.ddot(F, F) - wp.float64(3.0))
-    return shear + volumetric_energy(J, m)
+    d = s - wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0))
+    return m.mu * wp.dot(d, d) + volumetric_energy(J, m)
 
 
 @wp.func

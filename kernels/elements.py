@@ -18,7 +18,9 @@ from gdpro_sim.kernels.elasticity import (
     Constants,
     energy_density,
     green_strain_increment,
+    linear_energy,
     needs_stretches,
+    neo_hookean_energy,
     piola_stress,
     piola_stress_in_frame,
     principal_hessian,
@@ -127,6 +129,37 @@ def element_volume_ratio(
 def element_energy(
     start: int,
     # In:
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    cauchy_green: wp.array[wp.mat33d],
+    inverse_dt: wp.float64,
+    # Out:
+    energy_out: wp.array[wp.float64],
+):
+    """Elastic energy plus damping potential of each element, J. inverse_dt = 0 leaves the damping out.
+
+    For laws that need no singular values.
+    """
+    e = start + wp.tid()
+    F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
+    m = Constants()
+    m.law = elements.law[e]
+    m.mu = elements.mu[e]
+    m.lam = elements.lam[e]
+    density = neo_hookean_energy(F, m)
+    if m.law == LINEAR:
+        density = linear_energy(F, m)
+    rate = elements.damping[e] * inverse_dt
+    if rate > wp.float64(0.0):
+        strain = green_strain_increment(F, cauchy_green[e])
+        density += viscous_energy(strain, rate * m.mu, rate * m.lam)
+    energy_out[e] = elements.volume[e] * density
+
+
+@wp.kernel
+def element_energy_by_stretches(
+    start: int,
+    # In:
     lanes: int,
     count: int,
     elements: Elements,
@@ -138,24 +171,17 @@ def element_energy(
     # Out:
     energy_out: wp.array[wp.float64],
 ):
-    """Elastic energy plus damping potential of each element, J. inverse_dt = 0 leaves the damping out.
+    """`element_energy` for every law; where an element yields, what the flow dissipates is in it too.
 
-    Where an element yields, what the flow dissipates is in it too. The index is a group, as in
-    `element_derivatives`.
+    The index is a group, as in `element_derivatives`.
     """
     group = start + wp.tid()
     place = wp.where(lanes == 1, group, start)
-    end = wp.min(count, (group + 1) * lanes)
-    stretched = bool(False)
-    for e in range(group * lanes, end):
-        stretched = stretched or needs_stretches(elements.law[e])
-    if stretched:
-        decompose_group(group, place, count, elements.tets, elements.inverse_rest, x, work_out)
-    for e in range(group * lanes, end):
-        F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
-        s = wp.vec3d()
-        if stretched:
-            s = read_vector(work_out, place * WORK * lanes + e - group * lanes, lanes, S_SLOT)
+    decompose_group(group, place, count, elements.tets, elements.inverse_rest, x, work_out)
+    for e in range(group * lanes, wp.min(count, (group + 1) * lanes)):
+        at = place * WORK * lanes + e - group * lanes
+        F = read_matrix(work_out, at, lanes, F_SLOT)
+        s = read_vector(work_out, at, lanes, S_SLOT)
         m = constants_of(elements, e)
         density = energy_density(F, s, m)
         rate = elements.damping[e] * inverse_dt

@@ -9,6 +9,7 @@ import warp as wp
 
 from gdpro_sim.device import Launches
 from gdpro_sim.kernels import element_lanes, elements, fem, linalg
+from gdpro_sim.kernels.elasticity import COROTATED, STVK_HENCKY
 from gdpro_sim.simulation.fem.conjugate_gradient import ConjugateGradient
 from gdpro_sim.simulation.fem.nodal_pressure import NodalPressure, kept_lambda
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
@@ -107,6 +108,7 @@ class IncrementalPotential:
         ]
         self._pair_count = len(topology.upper)
         self._damped = bool(np.any(model.rayleigh_stiffness > 0.0))
+        self._stretches = bool(np.isin(rest.law, [int(COROTATED), int(STVK_HENCKY)]).any())
         self._yields = bool(np.any(np.isfinite(rest.yield_stress)))
         self._inverse_h = 0.0
 
@@ -164,13 +166,17 @@ class IncrementalPotential:
 
     def _evaluate_elements(self, x: wp.array, inverse_h: float) -> None:
         """Energies of the elements at x, the first of `_energies`; inverse_h = 0 leaves damping out."""
-        self._launch(
-            elements.element_energy,
-            self._groups,
-            [self._lanes, self.element_count, self.elements, x, self._cauchy_green, inverse_h],
-            [self._work, self._energies],
-            minimum=512,
-        )
+        inputs = [self.elements, x, self._cauchy_green, inverse_h]
+        if self._stretches:
+            self._launch(
+                elements.element_energy_by_stretches,
+                self._groups,
+                [self._lanes, self.element_count, *inputs],
+                [self._work, self._energies],
+                minimum=64,
+            )
+        else:
+            self._launch(elements.element_energy, self.element_count, inputs, [self._energies], minimum=4096)
 
     def linearise(self, x: wp.array, *, exact: bool = False) -> None:
         """Fill the linear system H d = -gradient at x; elements' parts are projected unless `exact`."""
