@@ -242,6 +242,21 @@ def test_slides_above_the_friction_angle() -> None:
     assert travelled == pytest.approx(speed * 0.5 + 0.5 * acceleration * 0.25, rel=0.02)
 
 
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
+def test_other_integrators_keep_bodies_apart(integrator: str) -> None:
+    vertices, tets, owner = join(cube((0, 0, 0.001)), cube((0.05, 0.04, SIZE + 0.01)))
+    velocities = np.where(owner[:, None] == 1, [0.0, 0.0, -2.0], 0.0)
+    model = make_model(
+        vertices, tets, young=1e5, velocities=velocities, ground=Ground(), integrator=integrator
+    )
+    solver = SolverFEM(model)
+    for _ in range(6):
+        solver.step(1 / 60)
+        assert solver.diagnostics().converged
+        assert not intersects(model, solver.positions)
+    assert len(contact_of(solver)._active) > 0
+
+
 def test_a_heavy_body_on_a_light_one() -> None:
     """Mass ratio 1e4."""
     vertices, tets, owner = join(cube((0, 0, 0.001)), cube((0.02, 0.01, SIZE + 0.01)))

@@ -2,8 +2,10 @@
 
 Every vertex has a penalty and lagged Coulomb friction against every obstacle. Where an obstacle is thin the
 penalty turns into a barrier halfway through it, and steps end before a vertex could come out on the other
-side, so nothing tunnels at any speed. A moving obstacle is met in its own frame. Contact is that of vertices:
-an edge or a corner of an obstacle smaller than the body's triangles can poke through between them.
+side, so nothing tunnels at any speed. A moving obstacle is met in its own frame; one that goes through more
+than half its own thickness within the shortest substep, into something at rest, is a SolverError. Contact is
+that of vertices: an edge or a corner of an obstacle smaller than the body's triangles can poke through
+between them.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ solver's own memory, on CUDA positions are copied over and back. It runs on one 
 several are in no fixed order.
 
 Surfaces never touch: they keep a gap below `FemSettings.contact_gap` times the smallest body's size, about
-half of it under the body's weight. Two bodies' friction coefficients combine by their geometric mean.
+half of it under the body's weight. Two bodies' friction coefficients combine by their geometric mean. The
+barrier is too stiff near contact for explicit steps, which end in a SolverError in any but a slow touch.
 """
 
 from __future__ import annotations
