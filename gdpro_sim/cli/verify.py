@@ -111,5 +111,5 @@ def _line(check: Check) -> str:
         expected, error, bound = f"{sign} {check.expected:.6g}", "", ""
     else:
         expected, error = f"{check.expected:.6g}", f"{check.error:.1e}"
-        bound = f"{check.bound:.0e}"
+        bound = f"{check.bound:.2g}"
     return f"{quantity:<{QUANTITY_WIDTH}}{expected:>14}{check.measured:>14.6g}{error:>10}{bound:>10}  {state}"
