@@ -86,11 +86,12 @@ class _Outcome:
 class SolverFEM:
     """Linear-tet FEM for a compiled `Model`; implements `gdpro_sim.simulation.model.Solver`.
 
-    Elements with lumped mass and Rayleigh damping, fixed vertices, and terms: the ground with lagged Coulomb
-    friction. Positions and all solver arithmetic are float64. On the CPU results are the same bytes for any
-    number of threads.
+    Elements with lumped mass and Rayleigh damping, fixed vertices, and terms: forces, contact with colliders
+    and between bodies. Positions and all solver arithmetic are float64: steps are accepted by comparing
+    energies of nearly equal states, and the stress of a stiff body is a small difference of large numbers.
+    On the CPU results are the same bytes for any number of threads.
 
-    Raises SolverError when an element has no volume at rest.
+    Raises SolverError when an element has no volume at rest, or two bodies overlap at the start.
     """
 
     def __init__(self, model: Model) -> None:
