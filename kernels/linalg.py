@@ -208,11 +208,9 @@ _CG_SERIAL = f"""
     double* const p = z + 4 * (size_t)rows;
     double* const q = p + 4 * (size_t)rows;
     double* const y = q + 4 * (size_t)rows;
-    double* const change = y + 4 * (size_t)rows;
     double* const scalars = scalars_out.data;
     const bool averaged = curvature.shape[0] > 0;
     const double* const forward_ = (const double*)forward.data;
-    const double* const transposed_ = (const double*)transposed.data;
 
     auto precondition = [&](int i) {{
         // The rows of a symmetric matrix are its columns.
@@ -287,25 +285,21 @@ _CG_SERIAL = f"""
             pq += dot(v, t);
         }}
         if (averaged) {{
-            // q += G^T D G p
+            // q += G^T D G p, each row of G read once; spare numbers of q collect what is never used.
             for (int i = 0; i < rows; ++i) {{
                 D total = (D)0.0;
-                const int end = offsets.data[i + 1];
-                for (int k = offsets.data[i]; k < end; ++k)
+                const int begin = offsets.data[i], end = offsets.data[i + 1];
+                for (int k = begin; k < end; ++k)
                     total += load(forward_ + 3 * (size_t)k) * load(p + 4 * (size_t)columns.data[k]);
-                change[i] = curvature.data[i] * ((total[0] + total[1]) + total[2]);
+                const D change = (D)(curvature.data[i] * ((total[0] + total[1]) + total[2]));
+                for (int k = begin; k < end; ++k) {{
+                    double* const to = q + 4 * (size_t)columns.data[k];
+                    store(to, load(to) + change * load(forward_ + 3 * (size_t)k));
+                }}
             }}
             pq = 0.0;
-            for (int i = 0; i < rows; ++i) {{
-                const size_t at = 4 * (size_t)i;
-                D t = load(q + at);
-                const int end = offsets.data[i + 1];
-                for (int k = offsets.data[i]; k < end; ++k)
-                    t += change[columns.data[k]] * load(transposed_ + 3 * (size_t)k);
-                t[3] = 0.0;
-                store(q + at, t);
-                pq += dot(load(p + at), t);
-            }}
+            for (int i = 0; i < rows; ++i)
+                pq += dot(load(p + 4 * (size_t)i), load(q + 4 * (size_t)i));
         }}
         definite = pq > 0.0;
         if (!definite) break;
@@ -348,7 +342,6 @@ def cg_solve(
     extra_columns: wp.array[wp.int32],
     extra_values: wp.array[wp.mat33d],
     forward: wp.array[wp.vec3d],
-    transposed: wp.array[wp.vec3d],
     curvature: wp.array[wp.float64],
     inverse_diagonal: wp.array[wp.mat33d],
     right_hand_side: wp.array[wp.vec3d],
@@ -374,7 +367,6 @@ def cg_serial(
     extra_columns: wp.array[wp.int32],
     extra_values: wp.array[wp.mat33d],
     forward: wp.array[wp.vec3d],
-    transposed: wp.array[wp.vec3d],
     curvature: wp.array[wp.float64],
     inverse_diagonal: wp.array[wp.mat33d],
     right_hand_side: wp.array[wp.vec3d],
@@ -402,7 +394,6 @@ def cg_serial(
         extra_columns,
         extra_values,
         forward,
-        transposed,
         curvature,
         inverse_diagonal,
         right_hand_side,

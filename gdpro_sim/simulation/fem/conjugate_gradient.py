@@ -47,7 +47,7 @@ class ConjugateGradient:
         self.offsets: wp.array = wp.array(topology.offsets, dtype=wp.int32, device=device)
         self.columns: wp.array = wp.array(topology.columns, dtype=wp.int32, device=device)
         self._diagonal: wp.array = wp.array(topology.diagonal, dtype=wp.int32, device=device)
-        self._work = wp.zeros(21 * self.rows, dtype=wp.float64, device=device)
+        self._work = wp.zeros(20 * self.rows, dtype=wp.float64, device=device)
         self.values = wp.zeros(len(topology.columns), dtype=wp.mat33d, device=device)
         self._extra_offsets = wp.zeros(self.rows + 1, dtype=wp.int32, device=device)
         self._extra_columns = wp.zeros(0, dtype=wp.int32, device=device)
@@ -140,7 +140,6 @@ class ConjugateGradient:
                 self._extra_columns,
                 self._extra_values,
                 self._forward,
-                self._transposed,
                 self._curvature,
                 self.inverse_diagonal,
                 self.right_hand_side,
