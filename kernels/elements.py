@@ -125,6 +125,30 @@ def element_volume_ratio(
     ratio_out[e] = wp.determinant(deformation_gradient(elements.tets[e], elements.inverse_rest[e], x))
 
 
+@wp.func
+def damping_energy(
+    elements: Elements, e: int, F: wp.mat33d, cauchy_green: wp.array[wp.mat33d], inverse_dt: wp.float64
+) -> wp.float64:
+    """Dissipation potential over the step, J/m^3; zero without damping, and for inverse_dt = 0."""
+    rate = elements.damping[e] * inverse_dt
+    if rate <= wp.float64(0.0):
+        return wp.float64(0.0)
+    strain = green_strain_increment(F, cauchy_green[e])
+    return viscous_energy(strain, rate * elements.mu[e], rate * elements.lam[e])
+
+
+@wp.func
+def damping_stress(
+    elements: Elements, e: int, F: wp.mat33d, cauchy_green: wp.array[wp.mat33d], inverse_dt: wp.float64
+) -> wp.mat33d:
+    """First Piola-Kirchhoff stress of `damping_energy`, Pa."""
+    rate = elements.damping[e] * inverse_dt
+    if rate <= wp.float64(0.0):
+        return wp.mat33d()
+    strain = green_strain_increment(F, cauchy_green[e])
+    return viscous_stress(F, strain, rate * elements.mu[e], rate * elements.lam[e])
+
+
 @wp.kernel
 def element_energy(
     start: int,
@@ -149,10 +173,7 @@ def element_energy(
     density = neo_hookean_energy(F, m)
     if m.law == LINEAR:
         density = linear_energy(F, m)
-    rate = elements.damping[e] * inverse_dt
-    if rate > wp.float64(0.0):
-        strain = green_strain_increment(F, cauchy_green[e])
-        density += viscous_energy(strain, rate * m.mu, rate * m.lam)
+    density += damping_energy(elements, e, F, cauchy_green, inverse_dt)
     energy_out[e] = elements.volume[e] * density
 
 
@@ -184,10 +205,7 @@ def element_energy_by_stretches(
         s = read_vector(work_out, at, lanes, S_SLOT)
         m = constants_of(elements, e)
         density = energy_density(F, s, m)
-        rate = elements.damping[e] * inverse_dt
-        if rate > wp.float64(0.0):
-            strain = green_strain_increment(F, cauchy_green[e])
-            density += viscous_energy(strain, rate * m.mu, rate * m.lam)
+        density += damping_energy(elements, e, F, cauchy_green, inverse_dt)
         energy_out[e] = elements.volume[e] * density
 
 
@@ -206,10 +224,7 @@ def element_gradient(
     e = start + wp.tid()
     F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
     m = constants_of(elements, e)
-    rate = elements.damping[e] * inverse_dt
-    P = piola_stress(F, m)
-    if rate > wp.float64(0.0):
-        P += viscous_stress(F, green_strain_increment(F, cauchy_green[e]), rate * m.mu, rate * m.lam)
+    P = piola_stress(F, m) + damping_stress(elements, e, F, cauchy_green, inverse_dt)
     forces = (elements.volume[e] * P) * wp.transpose(elements.inverse_rest[e])
     f1 = wp.vec3d(forces[0, 0], forces[1, 0], forces[2, 0])
     f2 = wp.vec3d(forces[0, 1], forces[1, 1], forces[2, 1])
@@ -243,9 +258,7 @@ def write_law(
         U = read_matrix(work_out, at, lanes, U_SLOT)
         V = read_matrix(work_out, at, lanes, V_SLOT)
     stress = piola_stress_in_frame(F, U, s, V, m)
-    if rate > wp.float64(0.0):
-        strain = green_strain_increment(F, cauchy_green[e])
-        stress += viscous_stress(F, strain, rate * m.mu, rate * m.lam)
+    stress += damping_stress(elements, e, F, cauchy_green, inverse_dt)
     write_matrix(stress, at, lanes, STRESS_SLOT, work_out)
     A, halves = principal_hessian(s, m)
     pairs = wp.matrix_from_rows(
