@@ -126,6 +126,18 @@ def element_volume_ratio(
 
 
 @wp.func
+def write_corners(e: int, columns: wp.mat33d, out: wp.array[wp.vec3d]):
+    """Vectors of corners 1 to 3, and that of corner 0, which makes their sum zero."""
+    c1 = wp.vec3d(columns[0, 0], columns[1, 0], columns[2, 0])
+    c2 = wp.vec3d(columns[0, 1], columns[1, 1], columns[2, 1])
+    c3 = wp.vec3d(columns[0, 2], columns[1, 2], columns[2, 2])
+    out[4 * e] = -(c1 + c2 + c3)
+    out[4 * e + 1] = c1
+    out[4 * e + 2] = c2
+    out[4 * e + 3] = c3
+
+
+@wp.func
 def damping_energy(
     elements: Elements, e: int, F: wp.mat33d, cauchy_green: wp.array[wp.mat33d], inverse_dt: wp.float64
 ) -> wp.float64:
@@ -138,15 +150,13 @@ def damping_energy(
 
 
 @wp.func
-def damping_stress(
-    elements: Elements, e: int, F: wp.mat33d, cauchy_green: wp.array[wp.mat33d], inverse_dt: wp.float64
+def damped(
+    stress: wp.mat33d, rate: wp.float64, m: Constants, F: wp.mat33d, cauchy_green: wp.mat33d
 ) -> wp.mat33d:
-    """First Piola-Kirchhoff stress of `damping_energy`, Pa."""
-    rate = elements.damping[e] * inverse_dt
-    if rate <= wp.float64(0.0):
-        return wp.mat33d()
-    strain = green_strain_increment(F, cauchy_green[e])
-    return viscous_stress(F, strain, rate * elements.mu[e], rate * elements.lam[e])
+    """`stress`, Pa, and that of `damping_energy`; `rate` is damping over the step's length."""
+    if rate > wp.float64(0.0):
+        return stress + viscous_stress(F, green_strain_increment(F, cauchy_green), rate * m.mu, rate * m.lam)
+    return stress
 
 
 @wp.kernel
@@ -224,15 +234,9 @@ def element_gradient(
     e = start + wp.tid()
     F = deformation_gradient(elements.tets[e], elements.inverse_rest[e], x)
     m = constants_of(elements, e)
-    P = piola_stress(F, m) + damping_stress(elements, e, F, cauchy_green, inverse_dt)
+    P = damped(piola_stress(F, m), elements.damping[e] * inverse_dt, m, F, cauchy_green[e])
     forces = (elements.volume[e] * P) * wp.transpose(elements.inverse_rest[e])
-    f1 = wp.vec3d(forces[0, 0], forces[1, 0], forces[2, 0])
-    f2 = wp.vec3d(forces[0, 1], forces[1, 1], forces[2, 1])
-    f3 = wp.vec3d(forces[0, 2], forces[1, 2], forces[2, 2])
-    gradient_out[4 * e] = -(f1 + f2 + f3)
-    gradient_out[4 * e + 1] = f1
-    gradient_out[4 * e + 2] = f2
-    gradient_out[4 * e + 3] = f3
+    write_corners(e, forces, gradient_out)
 
 
 @wp.func
@@ -257,8 +261,7 @@ def write_law(
     if needs_stretches(m.law):
         U = read_matrix(work_out, at, lanes, U_SLOT)
         V = read_matrix(work_out, at, lanes, V_SLOT)
-    stress = piola_stress_in_frame(F, U, s, V, m)
-    stress += damping_stress(elements, e, F, cauchy_green, inverse_dt)
+    stress = damped(piola_stress_in_frame(F, U, s, V, m), rate, m, F, cauchy_green[e])
     write_matrix(stress, at, lanes, STRESS_SLOT, work_out)
     A, halves = principal_hessian(s, m)
     pairs = wp.matrix_from_rows(

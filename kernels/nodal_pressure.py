@@ -26,7 +26,7 @@ from __future__ import annotations
 import warp as wp
 
 from gdpro_sim.kernels.elasticity import determinant_gradient
-from gdpro_sim.kernels.elements import Elements, deformation_gradient
+from gdpro_sim.kernels.elements import Elements, deformation_gradient, write_corners
 
 wp.set_module_options({"enable_backward": False})
 
@@ -139,13 +139,7 @@ def element_pressure(
     inverse_rest = elements.inverse_rest[e]
     F = deformation_gradient(tet, inverse_rest, x)
     areas = (wp.float64(0.25) * elements.volume[e] * determinant_gradient(F)) * wp.transpose(inverse_rest)
-    c1 = wp.vec3d(areas[0, 0], areas[1, 0], areas[2, 0])
-    c2 = wp.vec3d(areas[0, 1], areas[1, 1], areas[2, 1])
-    c3 = wp.vec3d(areas[0, 2], areas[1, 2], areas[2, 2])
-    slopes_out[4 * e] = -(c1 + c2 + c3)
-    slopes_out[4 * e + 1] = c1
-    slopes_out[4 * e + 2] = c2
-    slopes_out[4 * e + 3] = c3
+    write_corners(e, areas, slopes_out)
 
 
 @wp.func
