@@ -8,6 +8,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from gdpro_sim.binding import BoundGaussians
+from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import Embedding
 from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.conditions import Load, Motion, Springs
@@ -20,17 +21,20 @@ class Body:
     name:           unique within the scene
     gaussians:      bound Gaussians at the body's own size, in the asset's frame
     surface:        [V, 3] float32 m, rest surface vertices placed in the world
-    embedding:      surface vertices in this body's tets (tet ids count from the body's first tet)
+    embedding:      surface vertices in this body's tets (tet ids count from the body's first tet); None for a
+                    body of particles
     vertex_range:   (begin, end) into Model.vertices
     tet_range:      (begin, end) into Model.tets
+    particle_range: (begin, end) into Model.particles
     """
 
     name: str
     gaussians: BoundGaussians
     surface: np.ndarray
-    embedding: Embedding
-    vertex_range: tuple[int, int]
-    tet_range: tuple[int, int]
+    embedding: Embedding | None
+    vertex_range: tuple[int, int] = (0, 0)
+    tet_range: tuple[int, int] = (0, 0)
+    particle_range: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,57 @@ class FemSettings:
 
 
 @dataclass(frozen=True)
+class Particles:
+    """Material points of every MPM body, body after body. World space, SI units.
+
+    positions:  [N, 3] float32 m
+    velocities: [N, 3] float32 m/s
+    volumes:    [N] float32 m^3 at rest, > 0
+    matter:     [N] int32, number of the particle's material in `materials`
+    materials:  what the particles are made of; as many as there are different ones
+    spacing:    m, distance between neighbours: the cube root of a particle's volume
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    volumes: np.ndarray
+    matter: np.ndarray
+    materials: tuple[Material, ...]
+    spacing: float
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True)
+class MpmSettings:
+    """How the MPM solver steps.
+
+    integrator:    "explicit" takes as many substeps as sound and particle speeds ask for; "implicit" is
+                   backward Euler on the grid, for stiff elastic bodies
+    grid_spacing:  m, edge of a cell; None: twice the particles' spacing, which makes 8 of them a cell
+    kernel:        B-splines between particles and grid; "cubic" is smoother, and dearer
+    transfer:      "apic" keeps angular momentum; "pic" damps rotation and shear; "flip" keeps the particles'
+                   own velocities, and their noise, by `flip_ratio`
+    flip_ratio:    share of FLIP in "flip", the rest is APIC
+    cfl:           a substep is at most this many cells long for what moves at particle plus sound speed
+    max_substeps:  substeps per `step(dt)` past which the solver refuses
+    domain:        (low, high) corners of a closed box, m, that particles cannot leave; None: no walls
+    max_cells:     cells of the grid's bounding box past which the solver refuses
+    """
+
+    integrator: Literal["explicit", "implicit"] = "explicit"
+    grid_spacing: float | None = None
+    kernel: Literal["quadratic", "cubic"] = "quadratic"
+    transfer: Literal["apic", "pic", "flip"] = "apic"
+    flip_ratio: float = 0.95
+    cfl: float = 0.3
+    max_substeps: int = 20_000
+    domain: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    max_cells: int = 1 << 31
+
+
+@dataclass(frozen=True)
 class Model:
     """A compiled scene: everything constant. Arrays are float32 / int32 NumPy, SI units, world space.
 
@@ -96,6 +151,7 @@ class Model:
     motions, springs, loads: see `gdpro_sim.simulation.conditions`
     law:         [T] int32 constitutive law, a number of `gdpro_sim.materials.LAWS`; None: stable neo-Hookean
     yield_stress, hardening: [T] Pa, of elements with the law "stvk_hencky"; inf does not yield; None: none do
+    particles:   material points of the bodies that MPM simulates; None: FEM simulates tets
     """
 
     bodies: tuple[Body, ...]
@@ -123,6 +179,44 @@ class Model:
     springs: Springs | None = None
     loads: tuple[Load, ...] = ()
     colliders: tuple[Collider, ...] = ()
+    particles: Particles | None = None
+    mpm: MpmSettings = MpmSettings()
+
+    @staticmethod
+    def of_particles(
+        particles: Particles,
+        *,
+        bodies: tuple[Body, ...] = (),
+        gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+        ground: Ground | None = None,
+        mpm: MpmSettings | None = None,
+        colliders: tuple[Collider, ...] = (),
+        device: str = "cpu",
+    ) -> Model:
+        """A model without tets."""
+        none = np.zeros(0, np.float32)
+        return Model(
+            bodies=bodies,
+            vertices=np.zeros((0, 3), np.float32),
+            velocities=np.zeros((0, 3), np.float32),
+            tets=np.zeros((0, 4), np.int32),
+            fill=none,
+            young=none,
+            poisson=none,
+            density=none,
+            rayleigh_mass=none,
+            rayleigh_stiffness=none,
+            friction=none,
+            contact_offset=none,
+            pinned=np.zeros(0, bool),
+            gravity=gravity,
+            ground=ground,
+            fem=FemSettings(),
+            device=device,
+            colliders=colliders,
+            particles=particles,
+            mpm=mpm or MpmSettings(),
+        )
 
 
 @dataclass(frozen=True)
@@ -173,4 +267,14 @@ class Solver(Protocol):
         """Figures of the last step (of the initial state before any)."""
 
 
-__all__ = ["Body", "Diagnostics", "FemSettings", "Ground", "Integrator", "Model", "Solver"]
+__all__ = [
+    "Body",
+    "Diagnostics",
+    "FemSettings",
+    "Ground",
+    "Integrator",
+    "Model",
+    "MpmSettings",
+    "Particles",
+    "Solver",
+]

@@ -1,0 +1,1 @@
+"""Material point method: particles carry the matter, a grid moves them."""
