@@ -26,6 +26,8 @@ class Body:
     vertex_range:   (begin, end) into Model.vertices
     tet_range:      (begin, end) into Model.tets
     particle_range: (begin, end) into Model.particles
+    patches:        [V] int32, ascending: the patch each surface vertex belongs to, where the surface may come
+                    apart (`gdpro_sim.simulation.mpm.look.unweld`); None: it stays whole
     """
 
     name: str
@@ -35,6 +37,7 @@ class Body:
     vertex_range: tuple[int, int] = (0, 0)
     tet_range: tuple[int, int] = (0, 0)
     particle_range: tuple[int, int] = (0, 0)
+    patches: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
