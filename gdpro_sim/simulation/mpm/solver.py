@@ -1,0 +1,293 @@
+"""The material point method in time: explicit substeps as short as sound and particles ask for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from gdpro_sim.errors import SolverError
+from gdpro_sim.kernels import mpm_laws
+from gdpro_sim.kernels import particles as rows
+from gdpro_sim.simulation.model import Diagnostics, Model, Particles
+from gdpro_sim.simulation.mpm.boundaries import boundaries
+from gdpro_sim.simulation.mpm.grid import Grid
+from gdpro_sim.simulation.mpm.look import Look
+from gdpro_sim.simulation.mpm.matter import Matter
+
+
+@dataclass
+class _Counters:
+    substeps: int = 0
+    sorts: int = 0
+
+
+class SolverMPM:
+    """Explicit MLS-MPM for a compiled `Model`; implements `gdpro_sim.simulation.model.Solver`.
+
+    Particles and grid are float32; positions and deformations keep what rounding cuts off, so that slow
+    motion and small strains are not lost in short substeps. On the CPU results are the same bytes for any
+    number of threads.
+
+    Raises SolverError for a model without particles, or with particles without volume.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        particles = _checked(model)
+        settings = model.mpm
+        self.spacing = settings.grid_spacing or 2.0 * particles.spacing
+        self.matter = Matter(particles.materials, model.device)
+        kept = rows.ROWS if self.matter.flows else rows.TOTAL
+        self._initial = _fields(particles, self.matter, kept)
+        self.grid = Grid(
+            self._initial,
+            particles.matter,
+            spacing=self.spacing,
+            kernel=settings.kernel,
+            max_cells=settings.max_cells,
+            device=model.device,
+        )
+        self._rest = particles.positions
+        self._looks: dict[int, Look] = {}
+        self.boundaries = boundaries(model)
+        self._affine = 0.0 if settings.transfer == "pic" else 1.0
+        self._flip = settings.flip_ratio if settings.transfer == "flip" else 0.0
+        self._viscous_step = self.matter.largest_step(self.spacing)
+        self._time = 0.0
+        self._counters = _Counters()
+        self._others = {
+            f"boundaries.{k}.{name}": array
+            for k, boundary in enumerate(self.boundaries)
+            for name, array in boundary.state().items()
+        }
+        self._others_initial = {name: array.numpy().copy() for name, array in self._others.items()}
+        self.reset()
+
+    @property
+    def time(self) -> float:
+        """Simulated time, s."""
+        return self._time
+
+    @property
+    def positions(self) -> np.ndarray:
+        """[N, 3] float64 m, in the model's order."""
+        return self.grid.rows(rows.POSITION, 3).astype(np.float64) + self.grid.rows(rows.POSITION_LOW, 3)
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """[N, 3] float32 m/s, in the model's order."""
+        return self.grid.rows(rows.VELOCITY, 3)
+
+    @property
+    def deformations(self) -> np.ndarray:
+        """[N, 3, 3] float32 deformation gradients since the start, in the model's order."""
+        row = rows.TOTAL if self.matter.flows else rows.DEFORMATION
+        return self.grid.rows(row, 9).reshape(-1, 3, 3)
+
+    def reset(self) -> None:
+        """Back to the model's initial state."""
+        grid, count = self.grid, len(self._initial[0])
+        grid.particles.assign(self._initial)
+        particles = self.model.particles
+        assert particles is not None
+        grid.matter.assign(particles.matter)
+        grid.ids.assign(np.arange(count, dtype=np.int32))
+        for name, array in self._others.items():
+            array.assign(self._others_initial[name])
+        self._time = 0.0
+        self._counters = _Counters()
+        grid.sort()
+        self._update_stress(0.0)
+
+    def step(self, dt: float) -> None:
+        """Advance by `dt` seconds in substeps that follow the fastest particle.
+
+        Raises SolverError, leaving the state as it was, where that takes more than `max_substeps`, or
+        particles are lost.
+        """
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise SolverError(f"step length must be a finite number > 0 s, got {dt}")
+        saved, before = self.state_dict(), self._counters
+        try:
+            self._advance(dt)
+        except BaseException:  # Ctrl-C too: half a step is no state to continue from
+            self.load_state_dict(saved)
+            self._counters = before
+            raise
+
+    def _advance(self, dt: float) -> None:
+        begin, done, settings = self._time, 0.0, self.model.mpm
+        self._counters = _Counters()
+        self.grid.sort()
+        while done < dt:
+            left = dt - done
+            count = math.ceil(left / self._largest_step() - 1e-9)
+            if self._counters.substeps + count > settings.max_substeps:
+                raise SolverError(
+                    f"explicit substeps of {left / count:.3g} s would be needed "
+                    f"{self._counters.substeps + count:,} times in a step of {dt:.3g} s (at most "
+                    f"{settings.max_substeps:,}): soften the material, make cells larger, or use the implicit "
+                    "integrator"
+                )
+            h = left / count
+            self._substep(h)
+            done = dt if count == 1 else done + h
+            self._time = begin + done
+            self._counters.substeps += 1
+
+    def _largest_step(self) -> float:
+        """Longest stable substep, s."""
+        fastest = float(self.grid.particles[rows.SPEED].numpy().max())
+        if not math.isfinite(fastest):
+            raise SolverError(
+                f"particles are lost at t = {self._time:.6g} s: their speed is no number; use a smaller `cfl`, "
+                "or check velocities and material constants"
+            )
+        return min(self.model.mpm.cfl * self.spacing / max(fastest, 1e-30), self._viscous_step)
+
+    def _substep(self, h: float) -> None:
+        grid, gravity = self.grid, [h * g for g in self.model.gravity]
+        if grid.has_strayed():
+            grid.sort()
+            self._counters.sorts += 1
+        for boundary in self.boundaries:
+            boundary.begin(self._time, h)
+        if self._flip > 0.0:
+            grid.scatter(0.0, self._affine, (0.0, 0.0, 0.0))
+            grid.keep()
+        grid.scatter(h, self._affine, gravity)
+        for boundary in self.boundaries:
+            boundary.apply(grid, h)
+        if self._flip > 0.0:
+            grid.give_change()
+        grid.gather(h, self._flip)
+        for boundary in self.boundaries:
+            boundary.drive(grid, h)
+        self._update_stress(h)
+
+    def _update_stress(self, h: float) -> None:
+        """The materials' answer to the particles' deformation: stress, what has flowed, speed of sound."""
+        grid = self.grid
+        grid.launch(
+            mpm_laws.update_stress,
+            len(grid.ids),
+            [float(h), grid.matter, self.matter.table],
+            [grid.particles],
+        )
+
+    def surface_positions(self, body: int) -> np.ndarray:
+        """Deformed surface vertices of body number `body`, [V, 3] float32 m, world."""
+        begin, end = self.model.bodies[body].particle_range
+        look = self._looks.get(body)
+        if look is None:
+            item, rest = self.model.bodies[body], self._rest[begin:end]
+            look = Look(item.surface, rest, patches=item.patches, device=self.model.device)
+            self._looks[body] = look
+        return look.surface(self.positions[begin:end].astype(np.float32), self.deformations[begin:end])
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Everything needed to continue to the same bytes, after whole steps."""
+        grid = self.grid
+        return {
+            "time": np.array(self._time),
+            "particles": grid.particles.numpy().copy(),
+            "matter": grid.matter.numpy().copy(),
+            "ids": grid.ids.numpy().copy(),
+            **{name: array.numpy().copy() for name, array in self._others.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from a `state_dict`. Raises SolverError for one of another model."""
+        grid = self.grid
+        expected = self.state_dict()
+        for name, value in expected.items():
+            if name not in state or state[name].shape != value.shape:
+                raise SolverError(f"the state has no fitting {name!r}: it belongs to another model")
+        grid.particles.assign(state["particles"])
+        grid.matter.assign(state["matter"])
+        grid.ids.assign(state["ids"])
+        for name, array in self._others.items():
+            array.assign(state[name])
+        self._time = float(state["time"])
+        grid.sort()
+
+    def diagnostics(self) -> Diagnostics:
+        """Figures of the last step (of the initial state before any)."""
+        grid = self.grid
+        mass = grid.rows(rows.MASS, 1).astype(np.float64)
+        x, v = self.positions, self.velocities.astype(np.float64)
+        C = self._affine * grid.rows(rows.AFFINE, 9).reshape(-1, 3, 3).astype(np.float64)
+        inertia = grid.inertia
+        kinetic = 0.5 * float((mass[:, 0] * ((v**2).sum(1) + inertia * (C**2).sum((1, 2)))).sum())
+        spin = np.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], axis=1)
+        momentum = (mass * v).sum(0)
+        angular = (mass * (np.cross(x, v) + inertia * spin)).sum(0)
+        volume = np.linalg.det(self.deformations.astype(np.float64))
+        return Diagnostics(
+            time=self._time,
+            kinetic_energy=kinetic,
+            elastic_energy=self._elastic_energy(),
+            gravity_energy=-float((mass * x).sum(0) @ np.asarray(self.model.gravity)),
+            contact_energy=0.0,
+            momentum=(float(momentum[0]), float(momentum[1]), float(momentum[2])),
+            angular_momentum=(float(angular[0]), float(angular[1]), float(angular[2])),
+            contacts=0,
+            max_penetration=0.0,
+            min_volume_ratio=float(volume.min()),
+            substeps=self._counters.substeps,
+            newton_iterations=0,
+            cg_iterations=0,
+            converged=True,
+            residual=0.0,
+        )
+
+    def _elastic_energy(self) -> float:
+        grid = self.grid
+        energy: wp.array = wp.zeros(len(grid.ids), dtype=wp.float64, device=grid.device)
+        grid.launch(
+            mpm_laws.elastic_energy,
+            len(grid.ids),
+            [grid.matter, self.matter.table, grid.particles],
+            [energy],
+        )
+        return float(energy.numpy().sum())
+
+
+def _checked(model: Model) -> Particles:
+    particles = model.particles
+    if particles is None or not len(particles):
+        raise SolverError("the model has no particles")
+    volumes = particles.volumes
+    bad = np.flatnonzero(~(np.isfinite(volumes) & (volumes > 0.0)))
+    if len(bad):
+        raise SolverError(
+            f"particle {bad[0]} has volume {volumes[bad[0]]:.3g} m^3 ({len(bad)} such particles); it must be > 0"
+        )
+    for name in ("positions", "velocities"):
+        wrong = np.flatnonzero(~np.isfinite(getattr(particles, name)).all(axis=1))
+        if len(wrong):
+            raise SolverError(
+                f"particle {wrong[0]} has {name} that are no numbers ({len(wrong)} such particles)"
+            )
+    return particles
+
+
+def _fields(particles: Particles, matter: Matter, count: int) -> np.ndarray:
+    """The particles at rest, [count, N]; see `gdpro_sim.kernels.particles`."""
+    fields = np.zeros((count, len(particles)), np.float32)
+    fields[rows.POSITION : rows.POSITION + 3] = particles.positions.T
+    fields[rows.VELOCITY : rows.VELOCITY + 3] = particles.velocities.T
+    for first in (rows.DEFORMATION, rows.TOTAL):
+        if first < count:
+            fields[[first, first + 4, first + 8]] = 1.0
+    density = np.array([material.density for material in particles.materials], np.float64)
+    fields[rows.VOLUME] = particles.volumes
+    fields[rows.MASS] = density[particles.matter] * particles.volumes
+    fields[rows.INTERNAL : rows.INTERNAL + 4] = matter.internal(particles.matter)
+    return fields
+
+
+__all__ = ["SolverMPM"]
