@@ -86,8 +86,8 @@ class Grid:
         if cells > self.max_cells or max(abs(low).max(), abs(high).max()) > 2.0**30 * self.spacing:
             extent = " x ".join(f"{x:.3g}" for x in high - low)
             raise SolverError(
-                f"particles {extent} m apart would need a grid of {cells:,} cells of {self.spacing:.3g} m (at "
-                f"most {self.max_cells:,}): make cells larger, or walls (`domain`) to keep them together"
+                f"particles {extent} m apart would need a grid of {cells:,} cells of {self.spacing:.3g} m "
+                f"(at most {self.max_cells:,}): make cells larger, or walls (`domain`) to keep them together"
             )
         self.launch(
             mpm_grid.block_of_particles,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,7 +15,6 @@ from gdpro_sim.kernels import particles as rows
 from gdpro_sim.simulation.model import Diagnostics, Model, Particles
 from gdpro_sim.simulation.mpm.boundaries import boundaries
 from gdpro_sim.simulation.mpm.grid import Grid
-from gdpro_sim.simulation.mpm.look import Look
 from gdpro_sim.simulation.mpm.matter import Matter
 
 
@@ -51,7 +51,7 @@ class SolverMPM:
             device=model.device,
         )
         self._rest = particles.positions
-        self._looks: dict[int, Look] = {}
+        self._looks: dict[int, Any] = {}
         self.boundaries = boundaries(model)
         self._affine = 0.0 if settings.transfer == "pic" else 1.0
         self._flip = settings.flip_ratio if settings.transfer == "flip" else 0.0
@@ -129,8 +129,8 @@ class SolverMPM:
                 raise SolverError(
                     f"explicit substeps of {left / count:.3g} s would be needed "
                     f"{self._counters.substeps + count:,} times in a step of {dt:.3g} s (at most "
-                    f"{settings.max_substeps:,}): soften the material, make cells larger, or use the implicit "
-                    "integrator"
+                    f"{settings.max_substeps:,}): soften the material, make cells larger, or use the "
+                    "implicit integrator"
                 )
             h = left / count
             self._substep(h)
@@ -143,8 +143,8 @@ class SolverMPM:
         fastest = float(self.grid.particles[rows.SPEED].numpy().max())
         if not math.isfinite(fastest):
             raise SolverError(
-                f"particles are lost at t = {self._time:.6g} s: their speed is no number; use a smaller `cfl`, "
-                "or check velocities and material constants"
+                f"particles are lost at t = {self._time:.6g} s: their speed is no number; use a smaller "
+                "`cfl`, or check velocities and material constants"
             )
         return min(self.model.mpm.cfl * self.spacing / max(fastest, 1e-30), self._viscous_step)
 
@@ -180,6 +180,8 @@ class SolverMPM:
 
     def surface_positions(self, body: int) -> np.ndarray:
         """Deformed surface vertices of body number `body`, [V, 3] float32 m, world."""
+        from gdpro_sim.simulation.mpm.look import Look  # compiles kernels
+
         begin, end = self.model.bodies[body].particle_range
         look = self._looks.get(body)
         if look is None:
@@ -264,7 +266,8 @@ def _checked(model: Model) -> Particles:
     bad = np.flatnonzero(~(np.isfinite(volumes) & (volumes > 0.0)))
     if len(bad):
         raise SolverError(
-            f"particle {bad[0]} has volume {volumes[bad[0]]:.3g} m^3 ({len(bad)} such particles); it must be > 0"
+            f"particle {bad[0]} has volume {volumes[bad[0]]:.3g} m^3 ({len(bad)} such particles); it must be "
+            "> 0"
         )
     for name in ("positions", "velocities"):
         wrong = np.flatnonzero(~np.isfinite(getattr(particles, name)).all(axis=1))
