@@ -16,6 +16,21 @@ from gdpro_sim.kernels.particles import POSITION
 OFFSETS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(27, 3)
 """Of the blocks beside a block, in the order of `gdpro_sim.kernels.mpm_transfer`."""
 
+LINE = 16
+"""Floats of a line of a CPU's cache."""
+
+
+def _row_length(count: int) -> int:
+    """Floats from one row to the next for `count` particles.
+
+    27 lines of the cache past a multiple of 64 of them: all numbers of some neighbouring particles then lie
+    in different places of the cache, and none is taken for one that was just written (lines 4 KiB apart are,
+    until their addresses are known in full).
+    """
+    lines = -(-count // LINE)
+    return LINE * (lines + (27 - lines) % 64)
+
+
 WIDTHS = {"quadratic": 3, "cubic": 4}
 
 
@@ -26,8 +41,9 @@ class Grid:
     blocks: [count] node n of block g is number 4 blocks[g] + (n / 16, n / 4 % 4, n % 4)
     size:   m, extent of what the particles' blocks bound
 
-    Particle arrays belong to it because it sorts them: `particles` [rows, N] float32, see
-    `gdpro_sim.kernels.particles`, `matter` and `ids` [N] int32.
+    Particle arrays belong to it because it sorts them: `particles` [rows, >= N] float32, see
+    `gdpro_sim.kernels.particles`, `matter` and `ids` [N] int32. Rows are padded with zeros: were they a power
+    of two apart, all numbers of a particle would share one place in the cache.
     """
 
     def __init__(
@@ -44,16 +60,15 @@ class Grid:
         self.width = WIDTHS[kernel]
         self.launch = Launches(device)
         count = particles.shape[1]
-        self.particles, self._particles = (
-            wp.array(particles, dtype=float, device=device),
-            wp.zeros_like(wp.array(particles, dtype=float, device=device)),
-        )
+        shape = (len(particles), _row_length(count))
+        self.particles, self._particles = (wp.zeros(shape, dtype=float, device=device) for _ in range(2))
         ids = np.arange(count, dtype=np.int32)
         self.matter = wp.array(matter, dtype=int, device=device)
         self.ids = wp.array(ids, dtype=int, device=device)
         self._keys: wp.array = wp.zeros(count, dtype=int, device=device)
         self.owners: wp.array = wp.zeros(count, dtype=int, device=device)
         self.count = self.occupied = 0
+        self.put(particles)
         self._room: dict[str, wp.array] = {}
         self.change: wp.array | None = None
 
@@ -69,13 +84,19 @@ class Grid:
         array.assign(values)
         return array
 
+    def put(self, particles: np.ndarray) -> None:
+        """Give all particles their numbers, [rows, N] in the order of `ids`."""
+        padded = np.zeros(self.particles.shape, np.float32)
+        padded[:, : particles.shape[1]] = particles
+        self.particles.assign(padded)
+
     def sort(self) -> None:
         """Put the particles in order of their blocks, and make the blocks of nodes that they reach.
 
         Raises SolverError where they are nowhere (NaN) or too far apart for `max_cells`.
         """
         count = len(self.ids)
-        rows = self.particles[POSITION : POSITION + 3].numpy()
+        rows = self.particles[POSITION : POSITION + 3].numpy()[:, :count]
         low, high = rows.min(axis=1), rows.max(axis=1)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise SolverError("particles have positions that are no numbers")
@@ -239,7 +260,7 @@ class Grid:
     def rows(self, first: int, count: int) -> np.ndarray:
         """[N, count] numbers of each particle from row `first` on, in the model's order."""
         found = np.empty((len(self.ids), count), np.float32)
-        found[self.ids.numpy()] = self.particles[first : first + count].numpy().T
+        found[self.ids.numpy()] = self.particles[first : first + count].numpy()[:, : len(found)].T
         return found
 
     @property

@@ -90,7 +90,7 @@ class SolverMPM:
     def reset(self) -> None:
         """Back to the model's initial state."""
         grid, count = self.grid, len(self._initial[0])
-        grid.particles.assign(self._initial)
+        grid.put(self._initial)
         particles = self.model.particles
         assert particles is not None
         grid.matter.assign(particles.matter)
@@ -195,7 +195,7 @@ class SolverMPM:
         grid = self.grid
         return {
             "time": np.array(self._time),
-            "particles": grid.particles.numpy().copy(),
+            "particles": grid.particles.numpy()[:, : len(grid.ids)].copy(),
             "matter": grid.matter.numpy().copy(),
             "ids": grid.ids.numpy().copy(),
             **{name: array.numpy().copy() for name, array in self._others.items()},
@@ -208,7 +208,7 @@ class SolverMPM:
         for name, value in expected.items():
             if name not in state or state[name].shape != value.shape:
                 raise SolverError(f"the state has no fitting {name!r}: it belongs to another model")
-        grid.particles.assign(state["particles"])
+        grid.put(state["particles"])
         grid.matter.assign(state["matter"])
         grid.ids.assign(state["ids"])
         for name, array in self._others.items():
