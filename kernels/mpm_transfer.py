@@ -108,14 +108,14 @@ _GROUPS = """
     for (int first = starts.data[block]; first < end; first += 16) {
         const int lanes = end - first < 16 ? end - first : 16;
         {prelude}
-        auto row = [&](int r) {
+        auto row = [&](int r) __attribute__((always_inline)) {
             const float* const p = particles.data + (size_t)r * N + first;
             F v;
             if (lanes == 16) { __builtin_memcpy(&v, p, 64); return v; }
             for (int j = 0; j < 16; ++j) v[j] = p[j < lanes ? j : lanes - 1];
             return v;
         };
-        auto put = [&](int r, F v) {
+        auto put = [&](int r, F v) __attribute__((always_inline)) {
             float* const p = particles.data + (size_t)r * N + first;
             if (lanes == 16) { __builtin_memcpy(p, &v, 64); return; }
             for (int j = 0; j < lanes; ++j) p[j] = v[j];
@@ -198,7 +198,8 @@ _GATHER_EACH = """
         F R[16];
         for (int lane = lanes; lane < 16; ++lane) R[lane] = splat(0.0f);
         for (int lane = 0; lane < lanes; ++lane) {
-            const F w = W[lane], wk = SPREAD(w, 8);
+            const F wk = SPREAD(W[lane], 8);
+            const float* const w = (const float*)&W[lane];
             const float* const at = tile + begin[lane];
             F sum = splat(0.0f), along_x = splat(0.0f), along_y = splat(0.0f);
             for (int i = 0; i < WIDTH; ++i) {
@@ -206,12 +207,16 @@ _GATHER_EACH = """
                 for (int j = 0; j < WIDTH; ++j) {
                     F node;
                     __builtin_memcpy(&node, at + (i * TILE + j) * TILE * 4, 64);
-                    line += node * w[4 + j];
-                    weighted += node * (w[4 + j] * (float)j);
+                    node *= w[4 + j];
+                    line += node;
+                    if (j == 1) weighted = node;
+                    if (j > 1) weighted += (float)j * node;
                 }
-                sum += line * w[i];
-                along_x += line * (w[i] * (float)i);
+                line *= w[i];
+                sum += line;
                 along_y += weighted * w[i];
+                if (i == 1) along_x = line;
+                if (i > 1) along_x += (float)i * line;
             }
             sum *= wk;
             along_x *= wk;
@@ -239,7 +244,7 @@ _GATHER_MOVE = """
         for (int i = 0; i < 3; ++i)
             for (int a = 0; a < 3; ++a) C[3 * i + a] = (R[4 + 4 * a + i] - f[a] * R[i]) * scale;
         // Compensated sums: what is cut off goes along.
-        auto add_to = [&](int high, int low, F more) {
+        auto add_to = [&](int high, int low, F more) __attribute__((always_inline)) {
             const F before = row(high), y = more + row(low), after = before + y;
             put(high, after);
             put(low, y - (after - before));
