@@ -131,12 +131,13 @@ def inside(
     # In:
     mesh: wp.uint64,
     points: wp.array[wp.vec3],
+    level: float,
     # Out:
     inside_out: wp.array[int],
 ):
-    """1 where the generalised winding number is above one half, else 0."""
+    """1 where the generalised winding number is above `level`, else 0."""
     i = start + wp.tid()
-    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0e10, 2.0, 0.5)
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0e10, 2.0, level)
     inside_out[i] = 0
     if query.result and query.sign < 0.0:
         inside_out[i] = 1

@@ -29,9 +29,7 @@ def embed_surface(tetmesh: TetMesh, vertices: np.ndarray) -> Embedding:
         raise MeshError("vertices to embed hold NaN or infinite values")
     if not len(tetmesh.tets):
         raise MeshError("cannot embed a surface in a tet mesh without tets")
-    corner = tetmesh.vertices.astype(np.float64)[tetmesh.tets]
-    inverse = np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2))
-    origin = corner[:, 0]
+    corner, inverse, origin = _frames(tetmesh)
     tet_ids = _containing(corner, inverse, origin, points)
     outside = np.flatnonzero(tet_ids < 0)
     if len(outside):
@@ -53,6 +51,11 @@ def embed_surface(tetmesh: TetMesh, vertices: np.ndarray) -> Embedding:
     return Embedding(tet_ids.astype(np.int32), _float32_rows(weights))
 
 
+def containing_tets(tetmesh: TetMesh, points: np.ndarray) -> np.ndarray:
+    """The tet that each point [N, 3] m lies in, -1 for none; int64 [N]."""
+    return _containing(*_frames(tetmesh), np.asarray(points, np.float64))
+
+
 def boundary(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Outward triangles [B, 3] int32 that belong to one tet only, and that tet [B]."""
     faces = tets[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
@@ -60,6 +63,12 @@ def boundary(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     _, first, counts = np.unique(key, axis=0, return_index=True, return_counts=True)
     single = np.sort(first[counts == 1])
     return np.ascontiguousarray(faces[single], np.int32), single // 4
+
+
+def _frames(tetmesh: TetMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners [T, 4, 3], inverse edge matrices [T, 3, 3] and first corners [T, 3], float64."""
+    corner = tetmesh.vertices.astype(np.float64)[tetmesh.tets]
+    return corner, np.linalg.inv(np.swapaxes(corner[:, 1:] - corner[:, :1], 1, 2)), corner[:, 0]
 
 
 def _weights(inverse: np.ndarray, origin: np.ndarray, tet_ids: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -122,4 +131,4 @@ def _float32_rows(weights: np.ndarray) -> np.ndarray:
     return out
 
 
-__all__ = ["boundary", "embed_surface"]
+__all__ = ["boundary", "containing_tets", "embed_surface"]

@@ -72,16 +72,21 @@ def lattice(
     return _fill(v, faces, index, tets, origin, edge_length)
 
 
-def _surface_points(v: np.ndarray, faces: np.ndarray, size: float) -> np.ndarray:
-    """Points on every face no further apart than about half a cube, so that no crossed cube is missed."""
+def surface_points(v: np.ndarray, faces: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points [M, 3] on every face no further apart than about half of `size` m, and their faces [M].
+
+    A face's corners are among them; of a face longer than 32 times `size` they lie further apart.
+    """
     corner = v[faces]
     edges = np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2).max(1)
     steps = np.clip(np.ceil(edges / (0.5 * size)), 1, 64).astype(np.int64)
-    parts = [v]
+    parts, owners = [], []
     for n in np.unique(steps):
         grid = np.asarray([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)], np.float64) / n
-        parts.append(np.einsum("gc,fcd->fgd", grid, corner[steps == n]).reshape(-1, 3))
-    return np.concatenate(parts)
+        rows = np.flatnonzero(steps == n)
+        parts.append(np.einsum("gc,fcd->fgd", grid, corner[rows]).reshape(-1, 3))
+        owners.append(np.repeat(rows, len(grid)))
+    return np.concatenate(parts), np.concatenate(owners)
 
 
 def _cells(
@@ -98,7 +103,7 @@ def _cells(
     origin = 0.5 * (low + high) - 0.5 * shape * size
     centres = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 3)
     keep = index.inside(origin + (centres + 0.5) * size)
-    touched = np.clip(((_surface_points(v, faces, size) - origin) / size).astype(np.int64), 0, shape - 1)
+    touched = np.clip(((surface_points(v, faces, size)[0] - origin) / size).astype(np.int64), 0, shape - 1)
     keep[np.ravel_multi_index(tuple(touched.T), tuple(shape))] = True
     return centres[keep], origin
 
@@ -119,7 +124,7 @@ def _fill(
     samples = np.einsum("tsw,twc->tsc", weights, nodes[tets])
     fill = index.inside(samples.reshape(-1, 3)).reshape(len(tets), -1).mean(1)
     # Tets the surface passes through stay even when no sample is inside them: they carry its vertices.
-    local = (_surface_points(v, faces, size) - origin) / size
+    local = (surface_points(v, faces, size)[0] - origin) / size
     cube = np.clip(local.astype(np.int64), 0, cells.max(0))
     lookup = np.full(tuple(cells.max(0) + 1), -1, np.int64)
     lookup[tuple(cells.T)] = np.arange(len(cells))
@@ -142,4 +147,4 @@ def _fill(
     )
 
 
-__all__ = ["lattice"]
+__all__ = ["NO_VOLUME", "lattice", "surface_points"]

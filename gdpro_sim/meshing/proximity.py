@@ -110,8 +110,8 @@ class SurfaceIndex:
         launch_chunked(kernels.openness, len(points), inputs, [out], device="cpu")
         return out.numpy()
 
-    def inside(self, points: np.ndarray) -> np.ndarray:
-        """Whether each point lies inside by the generalised winding number (> 1/2), open meshes too; bool
+    def inside(self, points: np.ndarray, level: float = 0.5) -> np.ndarray:
+        """Whether each point lies inside: generalised winding number above `level`, open meshes too; bool
         [N].
 
         The index must have been made with `winding=True`.
@@ -123,7 +123,9 @@ class SurfaceIndex:
 
         flag = wp.empty(len(points), dtype=wp.int32, device="cpu")
         where: Any = wp.array(self._unit(points), dtype=wp.vec3, device="cpu")
-        launch_chunked(kernels.inside, len(points), [self._mesh.id, where], [flag], device="cpu")
+        launch_chunked(
+            kernels.inside, len(points), [self._mesh.id, where, float(level)], [flag], device="cpu"
+        )
         return flag.numpy() > 0
 
 
