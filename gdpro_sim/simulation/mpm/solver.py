@@ -64,6 +64,7 @@ class SolverMPM:
             for name, array in boundary.state().items()
         }
         self._others_initial = {name: array.numpy().copy() for name, array in self._others.items()}
+        self._saved = [wp.clone(array) for array in self._changing()]
         self.reset()
 
     @property
@@ -110,13 +111,24 @@ class SolverMPM:
         """
         if not (math.isfinite(dt) and dt > 0.0):
             raise SolverError(f"step length must be a finite number > 0 s, got {dt}")
-        saved, before = self.state_dict(), self._counters
+        before, time = self._counters, self._time
+        self._copy(self._changing(), self._saved)
         try:
             self._advance(dt)
         except BaseException:  # Ctrl-C too: half a step is no state to continue from
-            self.load_state_dict(saved)
-            self._counters = before
+            self._copy(self._saved, self._changing())
+            self._counters, self._time = before, time
+            self.grid.sort()
             raise
+
+    def _changing(self) -> list[wp.array]:
+        """Arrays that a step changes."""
+        return [self.grid.particles, self.grid.matter, self.grid.ids, *self._others.values()]
+
+    @staticmethod
+    def _copy(source: list[wp.array], target: list[wp.array]) -> None:
+        for a, b in zip(source, target, strict=True):
+            wp.copy(b, a)
 
     def _advance(self, dt: float) -> None:
         begin, done, settings = self._time, 0.0, self.model.mpm
