@@ -12,11 +12,17 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-Law = Literal["stable_neo_hookean", "neo_hookean", "corotated", "stvk_hencky", "linear"]
-"""Constitutive laws; `gdpro_sim.kernels.elasticity` gives their energies."""
+ElasticLaw = Literal["stable_neo_hookean", "neo_hookean", "corotated", "stvk_hencky", "linear"]
+"""Constitutive laws of bodies that keep their shape; `gdpro_sim.kernels.elasticity` gives their energies."""
 
-LAWS: tuple[str, ...] = get_args(Law)
+FlowLaw = Literal["drucker_prager", "snow", "herschel_bulkley", "fluid"]
+"""Constitutive laws of what flows, for MPM alone; `gdpro_sim.kernels.mpm_laws` says what they are."""
+
+LAWS: tuple[str, ...] = get_args(ElasticLaw)
 """In the order of the numbers that the kernels know them by."""
+
+FLOW_LAWS: tuple[str, ...] = get_args(FlowLaw)
+"""Their numbers follow those of `LAWS`."""
 
 
 def _values(
@@ -100,31 +106,94 @@ PRESETS: dict[str, dict[str, float]] = {
 """Named presets. Sources stand beside each; friction is against a dry floor, damping is chosen."""
 
 
+LAW_FIELDS: dict[str, tuple[str, ...]] = {
+    "hardening": ("stvk_hencky",),
+    "bulk_modulus": ("fluid",),
+    "viscosity": ("fluid", "herschel_bulkley"),
+    "flow_index": ("herschel_bulkley",),
+    "friction_angle": ("drucker_prager",),
+    "cohesion": ("drucker_prager",),
+    "critical_compression": ("snow",),
+    "critical_stretch": ("snow",),
+    "snow_hardening": ("snow",),
+    "tensile_strength": LAWS,
+    "fracture_energy": LAWS,
+}
+"""Fields that mean something for some laws alone."""
+
+
 class Material(BaseModel):
-    """An isotropic hyperelastic material, stable neo-Hookean (Smith, de Goes & Kim 2018) unless it says else.
+    """An isotropic material, stable neo-Hookean (Smith, de Goes & Kim 2018) unless it says else.
 
     With a yield stress it is elastic-plastic: von Mises with linear isotropic hardening, in logarithmic
-    strain, which takes the law "stvk_hencky".
+    strain, which takes the law "stvk_hencky". What flows or tears, MPM alone can simulate: sand
+    ("drucker_prager"), "snow", paste and foam ("herschel_bulkley"), "fluid", and all that has a tensile
+    strength.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: str | None = Field(default=None, description="name of the preset the values started from")
-    model: Law = Field(
+    model: ElasticLaw | FlowLaw = Field(
         default="stable_neo_hookean",
         description='constitutive law; with a yield stress "stvk_hencky"; "linear" is for small strains and '
-        "rotations",
+        'rotations, and for FEM; "drucker_prager", "snow", "herschel_bulkley" and "fluid" are for MPM',
     )
-    young: float = Field(gt=0.0, description="Young's modulus, Pa")
+    young: float = Field(gt=0.0, description="Young's modulus, Pa; a fluid has a bulk modulus instead")
     poisson: float = Field(ge=0.0, lt=0.5, description="Poisson's ratio")
     density: float = Field(gt=0.0, description="kg/m^3")
     friction: float = Field(default=0.5, ge=0.0, description="Coulomb coefficient against the ground")
     rayleigh_mass: float = Field(default=0.0, ge=0.0, description="Rayleigh damping on mass, 1/s")
     rayleigh_stiffness: float = Field(default=0.0, ge=0.0, description="Rayleigh damping on stiffness, s")
     yield_stress: float | None = Field(
-        default=None, gt=0.0, description="von Mises stress at which it starts to flow, Pa; default: never"
+        default=None,
+        gt=0.0,
+        description="von Mises stress at which it starts to flow, Pa; sqrt(3) times that in shear; default: "
+        "never",
     )
     hardening: float = Field(default=0.0, ge=0.0, description="yield stress gained per plastic strain, Pa")
+    tensile_strength: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="MPM: largest principal stress at which it begins to tear, Pa; default: never",
+    )
+    fracture_energy: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="MPM: energy that tearing takes, J/m^2; default: as little as the particles allow",
+    )
+    bulk_modulus: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="of a fluid, Pa; its speed of sound should be ten times that of the flow, more is slow",
+    )
+    viscosity: float = Field(
+        default=0.0,
+        ge=0.0,
+        description='of a fluid in shear, Pa s; of "herschel_bulkley" the consistency k of '
+        "stress = yield + k rate^n in simple shear, Pa s^n",
+    )
+    flow_index: float = Field(
+        default=1.0, gt=0.0, description='exponent n of "herschel_bulkley"; below one it thins when sheared'
+    )
+    friction_angle: float | None = Field(
+        default=None,
+        gt=0.0,
+        lt=90.0,
+        description='of "drucker_prager", degrees: that of triaxial compression, near the angle of repose',
+    )
+    cohesion: float = Field(
+        default=0.0, ge=0.0, description='of "drucker_prager", Pa: shear strength without pressure (wet sand)'
+    )
+    critical_compression: float = Field(
+        default=2.5e-2, gt=0.0, lt=1.0, description='of "snow": strain past which it is packed for good'
+    )
+    critical_stretch: float = Field(
+        default=7.5e-3, gt=0.0, description='of "snow": strain past which it breaks up'
+    )
+    snow_hardening: float = Field(
+        default=10.0, ge=0.0, description='of "snow": its stiffness grows as exp(this times packed strain)'
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -140,11 +209,15 @@ class Material(BaseModel):
             value = {**PRESETS[name], **value}
         if isinstance(value, dict) and value.get("yield_stress") is not None:
             value = {"model": "stvk_hencky", **value}
+        if isinstance(value, dict) and isinstance(value.get("bulk_modulus"), (int, float)):
+            value = {"young": 3.0 * value["bulk_modulus"], "poisson": 0.0, **value}
         return value
 
     @field_validator(
-        "young", "density", "friction", "rayleigh_mass", "rayleigh_stiffness", "yield_stress", "hardening"
-    )
+        "young", "density", "friction", "rayleigh_mass", "rayleigh_stiffness", "yield_stress", "hardening",
+        "tensile_strength", "fracture_energy", "bulk_modulus", "viscosity", "flow_index", "cohesion",
+        "critical_stretch", "snow_hardening",
+    )  # fmt: skip
     @classmethod
     def _finite(cls, value: float | None) -> float | None:
         if value is not None and not math.isfinite(value):
@@ -152,24 +225,58 @@ class Material(BaseModel):
         return value
 
     @model_validator(mode="after")
-    def _plastic_law(self) -> Material:
-        if self.yield_stress is not None and self.model != "stvk_hencky":
+    def _law_has_its_fields(self) -> Material:
+        if self.yield_stress is not None and self.model not in ("stvk_hencky", "herschel_bulkley"):
             raise ValueError(
                 f'a material with a yield stress needs the law "stvk_hencky", got {self.model!r}; leave '
                 "model out, or set yield_stress to null"
             )
+        for name, laws in LAW_FIELDS.items():
+            if self.model not in laws and getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(
+                    f"{name} means nothing for the law {self.model!r}; it is for {', '.join(laws)}: leave it "
+                    "out, or choose another model"
+                )
+        needed: dict[str, tuple[str, ...]] = {
+            "drucker_prager": ("friction_angle",),
+            "herschel_bulkley": ("yield_stress", "viscosity"),
+            "fluid": ("bulk_modulus",),
+        }
+        for name in needed.get(self.model, ()):
+            if not getattr(self, name):
+                raise ValueError(f"the law {self.model!r} needs {name} > 0")
+        if self.bulk_modulus is not None:
+            if (self.young, self.poisson) != (3.0 * self.bulk_modulus, 0.0):
+                raise ValueError("a fluid has a bulk_modulus: leave young and poisson out")
+        if self.fracture_energy is not None and self.tensile_strength is None:
+            raise ValueError("fracture_energy needs a tensile_strength")
+        if self.model == "linear" and self.tensile_strength is not None:
+            raise ValueError('the law "linear" is for FEM, which cannot tear: leave tensile_strength out')
         return self
 
     @property
     def law(self) -> int:
         """Number of the constitutive law in the kernels."""
-        return LAWS.index(self.model)
+        return (LAWS + FLOW_LAWS).index(self.model)
 
     @property
     def lame(self) -> tuple[float, float]:
-        """Lame parameters (lambda, mu) in Pa."""
+        """Lame parameters (lambda, mu) in Pa; of a fluid (bulk modulus, 0)."""
+        if self.bulk_modulus is not None:
+            return self.bulk_modulus, 0.0
         lam = self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
         return lam, self.young / (2.0 * (1.0 + self.poisson))
 
+    def mpm_only(self) -> str | None:
+        """Why FEM cannot simulate it, in one line; None where it can."""
+        if self.model in FLOW_LAWS:
+            return f'the law "{self.model}" flows, which FEM cannot simulate: choose the solver "mpm"'
+        if self.tensile_strength is not None:
+            return (
+                "a material with a tensile_strength tears, which FEM cannot simulate: choose the solver "
+                '"mpm", or set tensile_strength to null'
+            )
+        return None
 
-__all__ = ["LAWS", "PRESETS", "Law", "Material"]
+
+__all__ = ["FLOW_LAWS", "LAWS", "PRESETS", "ElasticLaw", "FlowLaw", "Material"]
