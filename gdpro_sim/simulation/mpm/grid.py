@@ -72,15 +72,15 @@ class Grid:
         self._room: dict[str, wp.array] = {}
         self.change: wp.array | None = None
 
-    def _array(self, name: str, count: int, dtype: Any) -> wp.array:
+    def array(self, name: str, count: int, dtype: Any) -> wp.array:
         """An array of `count`, from memory that grows by halves and is kept."""
         held = self._room.get(name)
         if held is None or len(held) < count:
             held = self._room[name] = wp.zeros(count + count // 2, dtype=dtype, device=self.device)
         return held[:count]
 
-    def _set(self, name: str, values: np.ndarray, dtype: Any) -> wp.array:
-        array = self._array(name, len(values), dtype)
+    def set(self, name: str, values: np.ndarray, dtype: Any) -> wp.array:
+        array = self.array(name, len(values), dtype)
         array.assign(values)
         return array
 
@@ -135,7 +135,7 @@ class Grid:
         """Take the particles in this order."""
         if np.array_equal(order, np.arange(len(order), dtype=order.dtype)):
             return
-        numbers = self._set("order", order, int)
+        numbers = self.set("order", order, int)
         if self.device == "cpu":
             self.launch(
                 mpm_grid.permute_rows,
@@ -164,16 +164,16 @@ class Grid:
         sources = np.full((len(nodes), 27), -1, np.int32)
         sources[neighbors[:, ::-1], np.arange(27)[None]] = np.arange(len(coords), dtype=np.int32)[:, None]
         self.occupied, self.count = len(coords), len(nodes)
-        self.starts = self._set("starts", starts, int)
-        self.coords = self._set("coords", (coords + first).astype(np.int32), wp.vec3i)
-        self.neighbors = self._set("neighbors", neighbors.ravel(), int)
-        self.sources = self._set("sources", sources.ravel(), int)
+        self.starts = self.set("starts", starts, int)
+        self.coords = self.set("coords", (coords + first).astype(np.int32), wp.vec3i)
+        self.neighbors = self.set("neighbors", neighbors.ravel(), int)
+        self.sources = self.set("sources", sources.ravel(), int)
         corners = np.stack(np.unravel_index(nodes, tuple(size)), axis=1) + first
-        self.blocks = self._set("blocks", corners.astype(np.int32), wp.vec3i)
-        self.values = self._array("values", 64 * self.count, wp.vec4)
-        self.strayed = self._array("strayed", self.occupied, int)
+        self.blocks = self.set("blocks", corners.astype(np.int32), wp.vec3i)
+        self.values = self.array("values", 64 * self.count, wp.vec4)
+        self.strayed = self.array("strayed", self.occupied, int)
         if self.device == "cpu":
-            self.tiles = self._array("tiles", self.occupied * mpm_transfer.tile_nodes(self.width), wp.vec4)
+            self.tiles = self.array("tiles", self.occupied * mpm_transfer.tile_nodes(self.width), wp.vec4)
         self.strayed.zero_()
 
     def scatter(self, h: float, affine: float, change: Sequence[float]) -> None:
@@ -210,7 +210,7 @@ class Grid:
 
     def keep(self) -> None:
         """Keep the nodes' velocities, for `give_change`."""
-        self.change = self._array("change", 64 * self.count, wp.vec4)
+        self.change = self.array("change", 64 * self.count, wp.vec4)
         wp.copy(self.change, self.values)
 
     def give_change(self) -> None:
