@@ -38,6 +38,8 @@ class Obstacles:
         low, high = np.asarray(low, float), np.asarray(high, float)
         self._items: list[tuple[Collider, BoundGaussians]] = []
         for collider in colliders:
+            if not collider.visible:
+                continue
             vertices, faces = _surface(collider, low, high)
             placed = vertices @ collider.rotation.T + collider.position
             mesh = SurfaceMesh.from_arrays(placed, faces, color=COLOR)
@@ -70,7 +72,7 @@ def with_obstacles(
     size = float(np.linalg.norm(high - low))
     boxes = [(low, high)]
     for collider in colliders:
-        if collider.kind == "plane":
+        if collider.kind == "plane" or not collider.visible:
             continue
         points = _surface(collider, low, high)[0] @ collider.rotation.T + collider.position
         if np.linalg.norm(np.ptp(points, axis=0)) > LARGE * size:

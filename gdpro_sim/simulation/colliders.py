@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.errors import MeshError
 from gdpro_sim.meshing.load import load_mesh
 from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.repair import face_normals, validate
-from gdpro_sim.simulation.conditions import Motion
+from gdpro_sim.simulation.conditions import FOREVER, Motion
 from gdpro_sim.simulation.motions import Moving
 from gdpro_sim.simulation.options import Number, Vector
 
@@ -24,6 +24,8 @@ ROOM = 0.9
 
 MESH_ROOM = 0.05
 """A vertex sinks no deeper into a mesh than this share of its size, however thick it is."""
+
+BoundaryKind = Literal["sticky", "slip", "separate"]
 
 Length = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
@@ -42,6 +44,39 @@ class ColliderBase(Moving):
         le=10.0,
         description="Coulomb coefficient; combines with a body's by the geometric mean; default: the body's",
     )
+    boundary: BoundaryKind = Field(
+        default="separate",
+        description="what touches it leaves freely and rubs by `friction` (separate), slides along it "
+        "without friction and never leaves (slip), or moves with it (sticky). MPM; FEM knows only separate",
+    )
+    start: float = Field(default=0.0, ge=0.0, description="s, when it begins to be there. MPM")
+    end: float | None = Field(default=None, gt=0.0, description="s, when it is gone; default: never. MPM")
+    mass: float | None = Field(
+        default=None, gt=0.0,
+        description="kg, of a rigid body that moves by what touches it, and by gravity; default: it does "
+        "not. MPM",
+    )  # fmt: skip
+    velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="m/s at the start, of one with `mass`")
+    angular_velocity: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="rad/s at the start, of one with `mass`"
+    )
+    visible: bool = Field(default=True, description="whether pictures show it")
+
+    @model_validator(mode="after")
+    def _driven_or_free(self) -> ColliderBase:
+        if self.end is not None and self.end <= self.start:
+            raise ValueError(f"end must be after start ({self.start:g} s), got {self.end:g} s")
+        if self.mass is None:
+            if any(self.velocity) or any(self.angular_velocity):
+                raise ValueError("a velocity needs a `mass`; give keyframes (`motion`) to what has none")
+            return self
+        if self.motion:
+            raise ValueError("give either `mass` (it moves freely) or `motion` (it is moved), one of the two")
+        if self.start or self.end is not None:
+            raise ValueError("what has a `mass` is there all the time; leave out `start` and `end`")
+        if isinstance(self, PlaneCollider | HeightfieldCollider):
+            raise ValueError(f"a {self.kind} has no end and cannot move freely; leave out `mass`")
+        return self
 
 
 class PlaneCollider(ColliderBase):
@@ -136,6 +171,11 @@ class Collider:
     size:     m: box half extents; sphere radius; capsule and cylinder radius and half length; mesh reach
     room:     m, how deep a vertex may be inside before it could come out elsewhere; 0 for endless
     friction: Coulomb coefficient, combined with a vertex's by the geometric mean; None takes the vertex's
+    boundary: what matter does that touches it (MPM)
+    start, end: s, when it is there (MPM)
+    mass:     kg of a rigid body that moves by what touches it (MPM); None: only by `motion`
+    velocity, angular_velocity: m/s and rad/s at the start, of one with a mass
+    visible:  whether pictures show it
     vertices, faces: [V, 3] float64 m and [F, 3] int32 of a closed mesh, in its own frame
     """
 
@@ -149,6 +189,13 @@ class Collider:
     motion: Motion | None = None
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
+    boundary: BoundaryKind = "separate"
+    start: float = 0.0
+    end: float = FOREVER
+    mass: float | None = None
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    angular_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    visible: bool = True
 
     @staticmethod
     def floor(height: float) -> Collider:
@@ -168,6 +215,11 @@ def compile_collider(options: ColliderOptions, resolve: Callable[[str], Path] = 
         "rotation": rotation,
         "friction": options.friction,
         "motion": options.compiled(np.asarray(options.position)) if options.motion else None,
+        "end": FOREVER if options.end is None else options.end,
+        **{
+            key: getattr(options, key)
+            for key in ("boundary", "start", "mass", "velocity", "angular_velocity", "visible")
+        },
     }
     if isinstance(options, PlaneCollider):
         common["rotation"] = rotation @ _turned_to(np.asarray(options.normal))
@@ -259,6 +311,7 @@ def _three(*values: float) -> tuple[float, float, float]:
 
 
 __all__ = [
+    "BoundaryKind",
     "BoxCollider",
     "CapsuleCollider",
     "Collider",

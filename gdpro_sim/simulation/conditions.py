@@ -1,6 +1,7 @@
 """Boundary conditions and loads of a compiled scene: constant arrays, SI units, world space.
 
 Vertex ids and triangles are those of `Model.vertices`; triangles are outward boundary triangles of the tets.
+In a model of particles the ids of forces and impulses are those of its particles.
 Loads act from `start` to `end` in s; a step takes the share of it that they act.
 """
 
@@ -50,6 +51,19 @@ def pose_at(motion: Motion, time: float) -> tuple[np.ndarray, np.ndarray]:
             turn = Rotation.from_rotvec(share * way) * turn
     matrix = turn.as_matrix()
     return matrix, motion.pivot - matrix @ motion.pivot + shift
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Particles [n] int32 that are held where they are, or moved along, from `start` to `release` s.
+
+    motion: where they are taken; None: nowhere
+    """
+
+    particles: np.ndarray
+    motion: Motion | None = None
+    start: float = 0.0
+    release: float = FOREVER
 
 
 @dataclass(frozen=True)
@@ -117,4 +131,4 @@ class Wind:
 
 Load = Force | Impulse | Pressure | Wind
 
-__all__ = ["FOREVER", "Force", "Impulse", "Load", "Motion", "Pressure", "Springs", "Wind", "pose_at"]
+__all__ = ["FOREVER", "Force", "Hold", "Impulse", "Load", "Motion", "Pressure", "Springs", "Wind", "pose_at"]

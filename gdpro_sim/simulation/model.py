@@ -10,8 +10,8 @@ import numpy as np
 from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import Embedding
-from gdpro_sim.simulation.colliders import Collider
-from gdpro_sim.simulation.conditions import Load, Motion, Springs
+from gdpro_sim.simulation.colliders import BoundaryKind, Collider
+from gdpro_sim.simulation.conditions import Hold, Load, Motion, Springs
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Body:
     particle_range: (begin, end) into Model.particles
     patches:        [V] int32, ascending: the patch each surface vertex belongs to, where the surface may come
                     apart (`gdpro_sim.simulation.mpm.look.unweld`); None: it stays whole
+    vertex_colors:  [V, 3] float32 sRGB of a surface that is not the asset's; None: the asset's
     """
 
     name: str
@@ -38,13 +39,18 @@ class Body:
     tet_range: tuple[int, int] = (0, 0)
     particle_range: tuple[int, int] = (0, 0)
     patches: np.ndarray | None = None
+    vertex_colors: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A floor: the half-space z >= height is free; friction belongs to the bodies."""
+    """A floor: the half-space z >= height is free; friction belongs to the bodies.
+
+    boundary: what matter does that touches it (MPM)
+    """
 
     height: float = 0.0
+    boundary: BoundaryKind = "separate"
 
 
 Integrator = Literal["backward-euler", "bdf2", "midpoint", "quasi-static", "explicit"]
@@ -151,7 +157,7 @@ class Model:
                  it touches the ground that much later
     pinned:      [P] bool, vertices that are held where they are, or where `motions` take them
     release:     [P] s, when a pinned vertex is let go, inf for never; None: none is
-    motions, springs, loads: see `gdpro_sim.simulation.conditions`
+    motions, springs, loads, holds: see `gdpro_sim.simulation.conditions`
     law:         [T] int32 constitutive law, a number of `gdpro_sim.materials.LAWS`; None: stable neo-Hookean
     yield_stress, hardening: [T] Pa, of elements with the law "stvk_hencky"; inf does not yield; None: none do
     particles:   material points of the bodies that MPM simulates; None: FEM simulates tets
@@ -183,6 +189,7 @@ class Model:
     loads: tuple[Load, ...] = ()
     colliders: tuple[Collider, ...] = ()
     particles: Particles | None = None
+    holds: tuple[Hold, ...] = ()
     mpm: MpmSettings = MpmSettings()
 
     @staticmethod
@@ -194,6 +201,8 @@ class Model:
         ground: Ground | None = None,
         mpm: MpmSettings | None = None,
         colliders: tuple[Collider, ...] = (),
+        holds: tuple[Hold, ...] = (),
+        loads: tuple[Load, ...] = (),
         device: str = "cpu",
     ) -> Model:
         """A model without tets."""
@@ -216,8 +225,10 @@ class Model:
             ground=ground,
             fem=FemSettings(),
             device=device,
+            loads=loads,
             colliders=colliders,
             particles=particles,
+            holds=holds,
             mpm=mpm or MpmSettings(),
         )
 

@@ -18,8 +18,9 @@ import warp as wp
 from gdpro_sim.device import launch_chunked
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import colliders as kernels
+from gdpro_sim.simulation.collider_shapes import ColliderShape, placed
 from gdpro_sim.simulation.colliders import Collider
-from gdpro_sim.simulation.conditions import pose_at
+from gdpro_sim.simulation.conditions import FOREVER
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
 from gdpro_sim.simulation.fem.term import Step
 from gdpro_sim.simulation.model import Model
@@ -40,15 +41,6 @@ CONTACT_RAMP = 1e-4
 
 STANDARD_GRAVITY = 9.81
 
-KINDS = {
-    "plane": kernels.PLANE,
-    "box": kernels.BOX,
-    "sphere": kernels.SPHERE,
-    "capsule": kernels.CAPSULE,
-    "cylinder": kernels.CYLINDER,
-    "mesh": kernels.MESH,
-}
-
 
 class RigidBody:
     """A collider's data on the device: where it stood when the step began, and where it stands.
@@ -58,33 +50,14 @@ class RigidBody:
 
     def __init__(self, collider: Collider, device: str) -> None:
         self.collider = collider
-        self._mesh: Any = None
-        points: wp.array = wp.zeros(0, dtype=wp.vec3d, device=device)
-        triangles: wp.array = wp.zeros(0, dtype=wp.int32, device=device)
-        if collider.vertices is not None and collider.faces is not None:
-            points = wp.array(collider.vertices, dtype=wp.vec3d, device=device)
-            triangles = wp.array(collider.faces.ravel(), dtype=wp.int32, device=device)
-            coarse: wp.array = wp.array(collider.vertices.astype(np.float32), dtype=wp.vec3, device=device)
-            self._mesh = wp.Mesh(points=coarse, indices=triangles)
-        self.before, self.now = (self._struct(points, triangles) for _ in range(2))
+        self._shape = ColliderShape(collider, device)
+        self.before, self.now = self._shape.struct(), self._shape.struct()
         self.place(0.0, 0.0)
-
-    def _struct(self, points: wp.array, triangles: wp.array) -> Any:
-        struct = kernels.Collider()
-        struct.kind = KINDS[self.collider.kind]
-        struct.size = wp.vec3d(*self.collider.size)
-        struct.mesh = wp.uint64(0 if self._mesh is None else self._mesh.id)
-        struct.points = points
-        struct.triangles = triangles
-        return struct
 
     def place(self, start: float, time: float) -> None:
         """Stand `before` where it is at `start`, and `now` where it is at `time`, s."""
         for struct, when in ((self.before, start), (self.now, time)):
-            rotation, position = self.collider.rotation, self.collider.position
-            if self.collider.motion is not None:
-                turn, shift = pose_at(self.collider.motion, when)
-                rotation, position = turn @ rotation, turn @ position + shift
+            rotation, position = placed(self.collider, when)
             struct.rotation = wp.mat33d(*rotation.ravel())
             struct.position = wp.vec3d(*position)
 
@@ -203,7 +176,18 @@ class ColliderContact:
 
 
 def collider_contacts(model: Model, rest: RestShapes) -> tuple[ColliderContact, ...]:
-    """Terms of the ground and every collider of a model."""
+    """Terms of the ground and every collider of a model.
+
+    Raises SolverError for what only MPM knows.
+    """
+    if model.ground is not None and model.ground.boundary != "separate":
+        raise SolverError("FEM's ground knows no `boundary` but \"separate\"; leave it out, or use MPM")
+    for collider in model.colliders:
+        for key, usual in (("boundary", "separate"), ("mass", None), ("start", 0.0), ("end", FOREVER)):
+            if getattr(collider, key) != usual:
+                raise SolverError(
+                    f"collider {collider.name!r}: FEM has no `{key}` of colliders; leave it out, or use MPM"
+                )
     floor = () if model.ground is None else (Collider.floor(model.ground.height),)
     return tuple(ColliderContact(model, rest, collider) for collider in (*floor, *model.colliders))
 
