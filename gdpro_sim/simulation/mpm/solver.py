@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from gdpro_sim.errors import SolverError
-from gdpro_sim.kernels import mpm_laws
+from gdpro_sim.kernels import mpm_energy, mpm_laws
 from gdpro_sim.kernels import particles as rows
 from gdpro_sim.simulation.model import Diagnostics, Model, Particles
 from gdpro_sim.simulation.mpm.boundaries import boundaries
@@ -185,9 +185,10 @@ class SolverMPM:
         grid = self.grid
         grid.launch(
             mpm_laws.update_stress,
-            len(grid.ids),
+            mpm_laws.groups(len(grid.ids), grid.device),
             [float(h), grid.matter, self.matter.table],
             [grid.particles],
+            minimum=64,
         )
 
     def surface_positions(self, body: int) -> np.ndarray:
@@ -262,7 +263,7 @@ class SolverMPM:
         grid = self.grid
         energy: wp.array = wp.zeros(len(grid.ids), dtype=wp.float64, device=grid.device)
         grid.launch(
-            mpm_laws.elastic_energy,
+            mpm_energy.elastic_energy,
             len(grid.ids),
             [grid.matter, self.matter.table, grid.particles],
             [energy],
