@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import defaultdict
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -22,45 +20,23 @@ from gdpro_sim import device as devices
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.model import Ground
 from tests.benchmarks.machine import machine
+from tests.benchmarks.shares import Shares
 from tests.simulation.fem_models import make_model, tet_box
 
 PARTS = ("assembly", "solve", "energy", "contact", "other")
 
 
-class Shares:
-    """Wall time by part of a solver's step; what a part calls of another counts there alone."""
-
-    def __init__(self, solver: SolverFEM, device: str) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-        self._part, self._since, self._device = "other", time.perf_counter(), device
-        potential = solver._potential
-        self._watch(potential, "linearise", "assembly")
-        self._watch(potential.system, "solve", "solve")
-        self._watch(solver._rigid, "correct", "solve")
-        self._watch(potential, "energy", "energy")
-        for term in solver.terms:
-            for name in ("lag", "energy", "add_derivatives", "largest_step", "finish"):
-                self._watch(term, name, "contact")
-
-    def _watch(self, owner: Any, name: str, part: str) -> None:
-        original = getattr(owner, name)
-
-        def timed(*inputs: Any, **options: Any) -> Any:
-            before = self.switch(part)
-            try:
-                return original(*inputs, **options)
-            finally:
-                self.switch(before)
-
-        setattr(owner, name, timed)
-
-    def switch(self, part: str) -> str:
-        """Count on for `part`; the part counted for until now."""
-        wp.synchronize_device(self._device)
-        now, before = time.perf_counter(), self._part
-        self.seconds[before] += now - self._since
-        self._part, self._since = part, now
-        return before
+def watched(solver: SolverFEM, device: str) -> Shares:
+    """Counts where the time of the solver's steps goes from now on."""
+    watch, potential = Shares(PARTS, device), solver._potential
+    watch.watch(potential, "linearise", "assembly")
+    watch.watch(potential.system, "solve", "solve")
+    watch.watch(solver._rigid, "correct", "solve")
+    watch.watch(potential, "energy", "energy")
+    for term in solver.terms:
+        for name in ("lag", "energy", "add_derivatives", "largest_step", "finish"):
+            watch.watch(term, name, "contact")
+    return watch
 
 
 def measure(cells: int, young: float, frames: int, device: str, shares: bool) -> str:
@@ -69,18 +45,18 @@ def measure(cells: int, young: float, frames: int, device: str, shares: bool) ->
     solver = SolverFEM(make_model(vertices, tets, young=young, poisson=0.4, ground=Ground(), device=device))
     solver.step(1 / 60)
     solver.reset()
-    watch = Shares(solver, device) if shares else None
+    watch = watched(solver, device) if shares else None
     times, newton, cg, substeps, unconverged = [], 0, 0, 0, 0
     processor = time.process_time()
     for _ in range(frames):
         begin = time.perf_counter()
         if watch:
-            watch.switch("other")
+            watch.begin()
         solver.step(1 / 60)
         wp.synchronize_device(device)
         times.append(1e3 * (time.perf_counter() - begin))
         if watch:
-            watch.switch("between frames")
+            watch.end()
         c = solver._counters
         newton += c.newton_iterations
         cg += c.cg_iterations
@@ -93,8 +69,7 @@ def measure(cells: int, young: float, frames: int, device: str, shares: bool) ->
         f"| {unconverged} |"
     )
     if watch:
-        whole = sum(watch.seconds[part] for part in PARTS)
-        row += "".join(f" {100 * watch.seconds[part] / whole:.0f} % |" for part in PARTS)
+        row += watch.columns()
     return row
 
 
