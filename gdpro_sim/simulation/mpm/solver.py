@@ -136,7 +136,7 @@ class SolverMPM:
         self.grid.sort()
         while done < dt:
             left = dt - done
-            count = math.ceil(left / self._largest_step() - 1e-9)
+            count = max(1, math.ceil(left / self._largest_step() - 1e-9))
             if self._counters.substeps + count > settings.max_substeps:
                 raise SolverError(
                     f"explicit substeps of {left / count:.3g} s would be needed "
