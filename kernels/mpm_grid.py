@@ -11,7 +11,8 @@ from gdpro_sim.kernels.particles import POSITION
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 
 
-def _sum_tiles(width: int) -> str:
+def sum_of_tiles(width: int, each: str) -> str:
+    """Text that sums the tiles over one grid block, and writes what `each` makes, `v`, of `sum[n]`."""
     return f"""
 #if !defined(__CUDACC__)
     typedef float Q __attribute__((ext_vector_type(4)));
@@ -43,22 +44,27 @@ def _sum_tiles(width: int) -> str:
     }}
     float* const out = (float*)(values_out.data + 64 * (size_t)block);
     for (int n = 0; n < 64; ++n) {{
-        const float mass = sum[n][3];
-        Q v = (Q)0.0f;
-        if (mass > 0.0f) {{
-            v = sum[n] / mass;
-            v[0] += change[0];
-            v[1] += change[1];
-            v[2] += change[2];
-            v[3] = mass;
-        }}
+        {each}
         __builtin_memcpy(out + 4 * n, &v, 16);
     }}
 #endif
 """
 
 
-@wp.func_native(_sum_tiles(3))
+_VELOCITY = """
+        const float mass = sum[n][3];
+        Q v = (Q)0.0f;
+        if (mass > 0.0f) {
+            v = sum[n] / mass;
+            v[0] += change[0];
+            v[1] += change[1];
+            v[2] += change[2];
+            v[3] = mass;
+        }
+"""
+
+
+@wp.func_native(sum_of_tiles(3, _VELOCITY))
 def sum_tiles_quadratic(
     block: int,
     change: wp.vec3,
@@ -70,7 +76,7 @@ def sum_tiles_quadratic(
     ...
 
 
-@wp.func_native(_sum_tiles(4))
+@wp.func_native(sum_of_tiles(4, _VELOCITY))
 def sum_tiles_cubic(
     block: int,
     change: wp.vec3,
@@ -119,7 +125,6 @@ def momentum_to_velocity(start: int, change: wp.vec3, values_out: wp.array[wp.ve
 def change_of_velocity(
     start: int,
     # In:
-    change: wp.vec3,
     values: wp.array[wp.vec4],
     # Out:
     change_out: wp.array[wp.vec4],

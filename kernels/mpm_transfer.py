@@ -133,12 +133,12 @@ _GROUPS = """
 #endif
 """
 
-_SCATTER_BEFORE = """
+SCATTER_BEFORE = """
     float* const tile = (float*)(tiles.data + (size_t)block * TILE_NODES);
     __builtin_memset(tile, 0, TILE_NODES * 16);
 """
 
-_SCATTER_EACH = """
+SCATTER_MOMENTUM = """
         const F m = row(MASS), pull = splat(-h * inverse * inverse * (WIDTH == 3 ? 4.0f : 3.0f));
         // Columns of dx (m C - h V tau / D): what one cell along each axis adds.
         F P[16];
@@ -152,6 +152,9 @@ _SCATTER_EACH = """
         for (int i = 0; i < 3; ++i)
             P[i] = m * row(VELOCITY + i) - f[0] * P[4 + i] - f[1] * P[8 + i] - f[2] * P[12 + i];
         P[3] = m;
+"""
+
+SCATTER_NODES = """
         transpose(P);
         for (int lane = 0; lane < lanes; ++lane) {
             const F p = P[lane], w = W[lane];
@@ -175,7 +178,7 @@ _SCATTER_EACH = """
         }
 """
 
-_GATHER_BEFORE = """
+GATHER_BEFORE = """
     float tile[TILE_NODES * 4 + 16];
     for (int i = 0; i < TILE; ++i)
         for (int j = 0; j < TILE; ++j) {
@@ -194,7 +197,7 @@ _GATHER_BEFORE = """
     int strayed = 0;
 """
 
-_GATHER_EACH = """
+GATHER_EACH = """
         F R[16];
         for (int lane = lanes; lane < 16; ++lane) R[lane] = splat(0.0f);
         for (int lane = 0; lane < lanes; ++lane) {
@@ -237,12 +240,15 @@ _GATHER_EACH = """
         transpose(R);
 """
 
-_GATHER_MOVE = """
+GATHER_AFFINE = """
         // Rows 0..2: sum w v; 4 + 4 a + i: sum w (node along axis a) v_i.
         const F scale = splat(inverse * (WIDTH == 3 ? 4.0f : 3.0f));
         F C[9];
         for (int i = 0; i < 3; ++i)
             for (int a = 0; a < 3; ++a) C[3 * i + a] = (R[4 + 4 * a + i] - f[a] * R[i]) * scale;
+"""
+
+_GATHER_MOVE = """
         // Compensated sums: what is cut off goes along.
         auto add_to = [&](int high, int low, F more) __attribute__((always_inline)) {
             const F before = row(high), y = more + row(low), after = before + y;
@@ -285,8 +291,8 @@ _GATHER_CHANGE = """
 """
 
 
-def _snippet(width: int, before: str, each: str, after: str = "") -> str:
-    """Text over one block's particles, 16 at a time."""
+def snippet(width: int, before: str, each: str, after: str = "") -> str:
+    """Text over one block's particles, 16 at a time: `before` them all, for `each` group, and `after`."""
     numbers = {
         "WIDTH": width,
         "TILE": tile_width(width),
@@ -314,11 +320,11 @@ def _snippet(width: int, before: str, each: str, after: str = "") -> str:
 
 
 _REPORT = "strayed_out.data[block] = strayed;"
-_MOVE = _GATHER_EACH + _GATHER_MOVE
-_CHANGE = _GATHER_EACH + _GATHER_CHANGE
+_MOVE = GATHER_EACH + GATHER_AFFINE + _GATHER_MOVE
+_CHANGE = GATHER_EACH + _GATHER_CHANGE
 
 
-@wp.func_native(_snippet(3, _SCATTER_BEFORE, _SCATTER_EACH))
+@wp.func_native(snippet(3, SCATTER_BEFORE, SCATTER_MOMENTUM + SCATTER_NODES))
 def scatter_quadratic(
     block: int,
     h: float,
@@ -334,7 +340,7 @@ def scatter_quadratic(
     ...
 
 
-@wp.func_native(_snippet(4, _SCATTER_BEFORE, _SCATTER_EACH))
+@wp.func_native(snippet(4, SCATTER_BEFORE, SCATTER_MOMENTUM + SCATTER_NODES))
 def scatter_cubic(
     block: int,
     h: float,
@@ -377,7 +383,7 @@ def scatter_blocks(
         scatter_cubic(b, h, spacing, 1.0 / spacing, affine, starts, coords, particles, tiles_out)
 
 
-@wp.func_native(_snippet(3, _GATHER_BEFORE, _MOVE, _REPORT))
+@wp.func_native(snippet(3, GATHER_BEFORE, _MOVE, _REPORT))
 def gather_quadratic(
     block: int,
     h: float,
@@ -394,7 +400,7 @@ def gather_quadratic(
     ...
 
 
-@wp.func_native(_snippet(4, _GATHER_BEFORE, _MOVE, _REPORT))
+@wp.func_native(snippet(4, GATHER_BEFORE, _MOVE, _REPORT))
 def gather_cubic(
     block: int,
     h: float,
@@ -441,7 +447,7 @@ def gather_blocks(
         gather_cubic(b, h, 1.0 / spacing, flip, starts, coords, neighbors, values, particles_out, strayed_out)
 
 
-@wp.func_native(_snippet(3, _GATHER_BEFORE, _CHANGE))
+@wp.func_native(snippet(3, GATHER_BEFORE, _CHANGE))
 def add_change_quadratic(
     block: int,
     inverse: float,
@@ -455,7 +461,7 @@ def add_change_quadratic(
     ...
 
 
-@wp.func_native(_snippet(4, _GATHER_BEFORE, _CHANGE))
+@wp.func_native(snippet(4, GATHER_BEFORE, _CHANGE))
 def add_change_cubic(
     block: int,
     inverse: float,
