@@ -31,6 +31,9 @@ def _row_length(count: int) -> int:
     return LINE * (lines + (27 - lines) % 64)
 
 
+FARTHEST = 1 << 21
+"""Cells from the origin at which float32 tells no eighth of a cell apart any more."""
+
 WIDTHS = {"quadratic": 3, "cubic": 4}
 
 
@@ -100,11 +103,16 @@ class Grid:
         low, high = rows.min(axis=1), rows.max(axis=1)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise SolverError("particles have positions that are no numbers")
+        if max(abs(low).max(), abs(high).max()) > FARTHEST * self.spacing:
+            raise SolverError(
+                f"particles lie {max(abs(low).max(), abs(high).max()):.3g} m from the origin, more than "
+                f"{FARTHEST:,} cells of {self.spacing:.3g} m: positions in float32 are too coarse there"
+            )
         reach = mpm_transfer.BLOCK * self.spacing
         first = np.floor(low / reach).astype(np.int64) - 2
         size = np.floor(high / reach).astype(np.int64) + 3 - first
         cells = int(np.prod(size.astype(object))) * mpm_transfer.BLOCK**3
-        if cells > self.max_cells or max(abs(low).max(), abs(high).max()) > 2.0**30 * self.spacing:
+        if cells > self.max_cells:
             extent = " x ".join(f"{x:.3g}" for x in high - low)
             raise SolverError(
                 f"particles {extent} m apart would need a grid of {cells:,} cells of {self.spacing:.3g} m "
