@@ -1,4 +1,4 @@
-"""Scene -> Model: load the assets, place them in the world, gather their tets into one set of arrays."""
+"""Scene -> Model: load the assets, place them in the world, gather tets or particles in one set of arrays."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import Asset, import_mesh, kind, tetrahedralize_asset
 from gdpro_sim.errors import SceneError
@@ -16,10 +15,11 @@ from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.colliders import MeshCollider, compile_collider
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
-from gdpro_sim.simulation.model import Body, FemSettings, Ground, Model
+from gdpro_sim.simulation.compile_mpm import compile_particles
+from gdpro_sim.simulation.model import Body, Ground, Model
+from gdpro_sim.simulation.placement import material_of, place
 from gdpro_sim.simulation.scene import Scene, SceneBody
-
-FALLBACK_MATERIAL = "jelly"
+from gdpro_sim.simulation.solver_options import MpmOptions
 
 
 def check_files(scene: Scene) -> None:
@@ -47,13 +47,14 @@ def load_assets(
     stored: dict[str, Path] | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> dict[str, Asset]:
-    """The asset of every body, with tets, by body name; meshes are imported.
+    """The asset of every body, with tets where the solver needs them, by body name; meshes are imported.
 
     `stored` names asset files of an earlier run of the same scene: they are taken as they are, because
     tetrahedralization is not repeatable. Raises MeshError, AssetError or SceneError.
     """
     check_files(scene)
     tell = on_progress or (lambda phase: None)
+    particles = isinstance(scene.solver, MpmOptions)
     assets: dict[str, Asset] = {}
     for body in scene.bodies:
         if stored and body.name in stored:
@@ -77,15 +78,16 @@ def load_assets(
                 color=body.color,
                 texture=None if body.texture is None else scene.resolve(body.texture),
                 up=body.up,
+                tets=not particles,
                 target_tets=body.tets,
                 seed=scene.seed,
                 on_progress=tell,
             )
-        if asset.tets is None:
+        if asset.tets is None and not particles:
             # At the asset's own size: the caller may place several bodies of one asset at several sizes.
             asset = tetrahedralize_asset(asset, target_tets=body.tets, on_progress=tell)
         if asset.material is None or body.material is not None:
-            asset = replace(asset, material=_material(body, asset))
+            asset = replace(asset, material=material_of(body, asset))
         assets[body.name] = asset
     return assets
 
@@ -93,9 +95,12 @@ def load_assets(
 def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu") -> Model:
     """Place every body and gather the arrays of a `Model` for `device`.
 
-    Raises SceneError where a body starts below the ground, has bad elements, or pins and loads select nothing
-    or contradict themselves.
+    Raises SceneError where a body starts below the ground, has bad elements or a material that the solver
+    cannot simulate, or pins and loads select nothing or contradict themselves.
     """
+    options = scene.solver
+    if isinstance(options, MpmOptions):
+        return compile_particles(scene, options, assets, device=device)
     bodies: list[Body] = []
     columns: dict[str, list[np.ndarray]] = {
         key: []
@@ -108,29 +113,20 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
     vertex_begin = tet_begin = 0
     for body in scene.bodies:
         asset = assets[body.name]
+        where = f"{scene.name}: body {body.name!r}"
         if asset.tets is None or asset.embedding is None:
-            raise SceneError(f"{scene.name}: body {body.name!r}: its asset has no tetrahedra")
-        _check_vertices(f"{scene.name}: body {body.name!r}", asset.tets)
-        material = _material(body, asset)
-        rest = asset.gaussians.vertices.cpu().numpy()
-        factor = body.scale
-        if body.size is not None:
-            factor = body.size / float(np.ptp(rest, axis=0).max())
-        asset = asset.scaled(factor) if factor != 1.0 else asset
+            raise SceneError(f"{where}: its asset has no tetrahedra")
+        _check_vertices(where, asset.tets)
+        material = _of_elements(where, body, asset)
+        placement = place(scene, body, asset)
+        asset = placement.asset
         assert asset.tets is not None and asset.embedding is not None
-        rest = asset.gaussians.vertices.cpu().numpy().astype(np.float64)
-        turn = Rotation.from_euler("xyz", body.rotation, degrees=True).as_matrix()
-        turned = rest @ turn.T
-        shift = np.asarray(body.position) - _anchor(turned, body.anchor)
-        surface = (turned + shift).astype(np.float32)
-        vertices = asset.tets.vertices.astype(np.float64) @ turn.T + shift
+        vertices = placement(asset.tets.vertices)
         centre = _centre_of_mass(asset.tets, vertices)
-        _check_above_ground(scene, body, surface)
 
         count, elements = len(vertices), len(asset.tets.tets)
         columns["vertices"].append(vertices.astype(np.float32))
-        spin = np.cross(np.asarray(body.angular_velocity)[None, :], vertices - centre)
-        columns["velocities"].append((spin + np.asarray(body.velocity)).astype(np.float32))
+        columns["velocities"].append(placement.velocities(body, vertices, centre))
         columns["tets"].append(asset.tets.tets + np.int32(vertex_begin))
         columns["fill"].append(asset.tets.fill)
         for key in ("young", "poisson", "density", "rayleigh_mass", "rayleigh_stiffness", "hardening"):
@@ -139,6 +135,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         columns["yield_stress"].append(np.full(elements, yields, np.float32))
         columns["law"].append(np.full(elements, material.law, np.int32))
         columns["friction"].append(np.full(count, material.friction, np.float32))
+        rest = asset.gaussians.vertices.cpu().numpy().astype(np.float64)
         columns["contact_offset"].append(
             distance_outside(asset.tets.vertices, rest, asset.gaussians.faces.cpu().numpy()).astype(
                 np.float32
@@ -148,7 +145,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
             Body(
                 name=body.name,
                 gaussians=asset.gaussians.to(device),
-                surface=surface,
+                surface=placement.surface,
                 embedding=asset.embedding,
                 vertex_range=(vertex_begin, vertex_begin + count),
                 tet_range=(tet_begin, tet_begin + elements),
@@ -156,19 +153,30 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         )
         vertex_begin += count
         tet_begin += elements
-    options = scene.solver
     arrays: dict[str, Any] = {key: np.concatenate(parts) for key, parts in columns.items()}
     model = Model(
         bodies=tuple(bodies),
         **arrays,
         pinned=np.zeros(vertex_begin, bool),
         gravity=scene.gravity,
-        ground=None if scene.ground is None else Ground(scene.ground.height),
-        colliders=tuple(compile_collider(options, scene.resolve) for options in scene.colliders),
-        fem=FemSettings(**{k: v for k, v in options.model_dump().items() if k != "kind"}),
+        ground=None if scene.ground is None else Ground(**scene.ground.model_dump()),
+        colliders=tuple(compile_collider(item, scene.resolve) for item in scene.colliders),
+        fem=options.settings(),
         device=device,
     )
     return apply_conditions(scene, model)
+
+
+def _of_elements(where: str, body: SceneBody, asset: Asset) -> Material:
+    """The body's material. Raises SceneError for what only MPM can simulate."""
+    material = material_of(body, asset)
+    reason = material.mpm_only()
+    if reason is not None:
+        raise SceneError(f"{where}: {reason}")
+    for key in ("particles", "parts"):
+        if getattr(body, key):
+            raise SceneError(f"{where}: `{key}` belongs to MPM (`solver: {{kind: mpm}}`)")
+    return material
 
 
 def _check_vertices(where: str, mesh: TetMesh) -> None:
@@ -186,30 +194,6 @@ def _centre_of_mass(tets: TetMesh, vertices: np.ndarray) -> np.ndarray:
     """Centre of mass [3] of placed tet `vertices` [P, 3] of one density."""
     mass = tets.volumes() * tets.fill
     return (mass[:, None] * vertices[tets.tets].mean(axis=1)).sum(axis=0) / mass.sum()
-
-
-def _material(body: SceneBody, asset: Asset) -> Material:
-    return body.material or asset.material or Material.model_validate(FALLBACK_MATERIAL)
-
-
-def _anchor(points: np.ndarray, anchor: str) -> np.ndarray:
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre = 0.5 * (low + high)
-    if anchor == "bottom":
-        return np.array([centre[0], centre[1], low[2]])
-    return centre if anchor == "center" else np.zeros(3)
-
-
-def _check_above_ground(scene: Scene, body: SceneBody, surface: np.ndarray) -> None:
-    if scene.ground is None:
-        return
-    low, extent = float(surface[:, 2].min()), float(np.ptp(surface[:, 2]))
-    below = scene.ground.height - low
-    if below > 0.05 * extent:
-        raise SceneError(
-            f"{scene.name}: body {body.name!r} starts {below:.3g} m below the ground at z = "
-            f"{scene.ground.height:g} m; raise its position by at least that much"
-        )
 
 
 __all__ = ["check_files", "compile_scene", "load_assets"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -32,7 +33,7 @@ def apply_conditions(scene: Scene, model: Model) -> Model:
 
     Raises SceneError for what selects nothing or contradicts itself.
     """
-    placed = [_Placed(scene, body, model) for body in model.bodies]
+    placed = [_Tets(scene, body, model) for body in model.bodies]
     by_name = {body.name: body for body in placed}
     pinned = np.zeros(len(model.vertices), bool)
     release = np.full(len(model.vertices), FOREVER)
@@ -40,7 +41,9 @@ def apply_conditions(scene: Scene, model: Model) -> Model:
     loads: list[Load] = []
     for body, item in zip(scene.bodies, placed, strict=True):
         motions += _pins(body, item, pinned, release)
-        loads += _loads(body, item, model)
+        if body.forces or body.impulses:
+            loads += compile_pushes(body, item, _masses(item, model))
+        loads += _pressures(body, item)
     for air in scene.wind:
         names = air.bodies or [body.name for body in scene.bodies]
         faces = np.concatenate([by_name[name].faces + by_name[name].first for name in dict.fromkeys(names)])
@@ -58,29 +61,30 @@ def apply_conditions(scene: Scene, model: Model) -> Model:
     )
 
 
-class _Placed:
-    """One body's tets where it stands at the start.
+class Placed:
+    """One body's points where they stand at the start: vertices, or particles.
 
     where:  how messages name it
-    first:  its first vertex in the model
+    first:  number of its first point in the model
     points: [n, 3] float64 m
-    tets:   [t, 4] and faces [f, 3], outward: from its own first vertex
+    kind:   "vertex" or "particle"
     """
 
-    def __init__(self, scene: Scene, body: Body, model: Model) -> None:
-        self.name = body.name
-        self.where = f"{scene.name}: bodies[{body.name}]"
-        self.first, end = body.vertex_range
-        self.points = model.vertices[self.first : end].astype(np.float64)
-        self.tets = model.tets[slice(*body.tet_range)] - np.int32(self.first)
-        self.faces, _ = boundary(self.tets)
+    def __init__(self, scene: Scene, name: str, points: np.ndarray, first: int, kind: str = "vertex") -> None:
+        self.name, self.where = name, f"{scene.name}: bodies[{name}]"
+        self.points, self.first, self.kind = points.astype(np.float64), first, kind
 
     @property
     def size(self) -> float:
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     def select(self, region: Region, key: str) -> np.ndarray:
-        """Vertex ids in a region, from the body's first. Raises SceneError where there are none."""
+        """Points in a region, counted from the body's first. Raises SceneError where there are none."""
+        if region.vertices is not None and self.kind != "vertex":
+            raise SceneError(
+                f"{self.where}.{key}.vertices: counts vertices of tets, which a body of particles has not; "
+                "give a box, a sphere or a side"
+            )
         try:
             ids = np.flatnonzero(region.select(self.points))
         except IndexError as error:
@@ -88,49 +92,74 @@ class _Placed:
                 f"{self.where}.{key}.vertices: no vertex {error}; the body has {len(self.points)}, from 0"
             ) from None
         if not len(ids):
-            raise SceneError(f"{self.where}.{key}: the {region.describe()} holds no vertex; {self.span()}")
+            raise SceneError(
+                f"{self.where}.{key}: the {region.describe()} holds no {self.kind}; {self.span()}"
+            )
         return ids
 
     def span(self) -> str:
         low, high = (np.round(corner, 3).tolist() for corner in (self.points.min(0), self.points.max(0)))
         return f"the body spans {low} to {high} m"
 
+
+class _Tets(Placed):
+    """A body of tets.
+
+    tets: [t, 4] and faces [f, 3], outward: from its own first vertex
+    """
+
+    def __init__(self, scene: Scene, body: Body, model: Model) -> None:
+        first, end = body.vertex_range
+        super().__init__(scene, body.name, model.vertices[first:end], first)
+        self.tets = model.tets[slice(*body.tet_range)] - np.int32(first)
+        self.faces, _ = boundary(self.tets)
+
     def tetmesh(self) -> TetMesh:
         fill = np.ones(len(self.tets), np.float32)
         return TetMesh(self.points.astype(np.float32), self.tets.astype(np.int32), fill, "tetwild")
 
 
-def _pins(body: SceneBody, item: _Placed, pinned: np.ndarray, release: np.ndarray) -> Iterator[Motion]:
-    """Marks pinned vertices and their release times; yields what moves."""
-    owner = np.full(len(item.points), -1)
+def chosen_pins(body: SceneBody, item: Placed) -> list[np.ndarray]:
+    """What each pin of a body holds. Raises SceneError for nothing, and for pins at odds with each other."""
     chosen = [item.select(pin, f"pins[{k}]") for k, pin in enumerate(body.pins)]
-    for k, (pin, ids) in enumerate(zip(body.pins, chosen, strict=True)):
-        for other in np.unique(owner[ids]).tolist():
-            if other >= 0 and not _agree(body.pins[other], chosen[other], pin, ids):
-                vertex = int(ids[owner[ids] == other][0])
-                raise SceneError(
-                    f"{item.where}: pins[{other}] and pins[{k}] both hold vertex {vertex} at "
-                    f"{np.round(item.points[vertex], 3).tolist()} m, but differ in motion or release; let "
-                    "their regions not overlap, or give both the same"
-                )
-        ids = ids[owner[ids] < 0]
-        owner[ids] = k
+    for (i, a), (j, b) in itertools.combinations(enumerate(body.pins), 2):
+        apart = (a.release or FOREVER) <= b.start or (b.release or FOREVER) <= a.start
+        if apart or _agree(a, chosen[i], b, chosen[j]):
+            continue
+        both = np.intersect1d(chosen[i], chosen[j])
+        if len(both):
+            raise SceneError(
+                f"{item.where}: pins[{i}] and pins[{j}] both hold {item.kind} {both[0]} at "
+                f"{np.round(item.points[both[0]], 3).tolist()} m, but differ in motion or release; let "
+                "their regions not overlap, or give both the same"
+            )
+    return chosen
+
+
+def _pins(body: SceneBody, item: _Tets, pinned: np.ndarray, release: np.ndarray) -> Iterator[Motion]:
+    """Marks pinned vertices and their release times; yields what moves."""
+    owned = np.zeros(len(item.points), bool)
+    for k, (pin, held) in enumerate(zip(body.pins, chosen_pins(body, item), strict=True)):
+        if pin.start > 0.0:
+            raise SceneError(f"{item.where}.pins[{k}].start: belongs to MPM (`solver: {{kind: mpm}}`)")
+        ids = held[~owned[held]]
+        owned[ids] = True
         pinned[item.first + ids] = True
         if pin.release is not None:
             release[item.first + ids] = pin.release
         if pin.motion and len(ids):
-            yield pin.compiled(item.points[chosen[k]].mean(axis=0), item.first + ids)
+            yield pin.compiled(item.points[held].mean(axis=0), item.first + ids)
 
 
 def _agree(a: Pin, a_ids: np.ndarray, b: Pin, b_ids: np.ndarray) -> bool:
-    if (a.motion, a.pivot, a.release) != (b.motion, b.pivot, b.release):
+    if (a.motion, a.pivot, a.start, a.release) != (b.motion, b.pivot, b.start, b.release):
         return False
     turns = a.pivot is None and any(any(key.rotation) for key in a.motion)
     return not turns or np.array_equal(a_ids, b_ids)
 
 
-def _loads(body: SceneBody, item: _Placed, model: Model) -> Iterator[Load]:
-    mass = _masses(item, model) if body.forces or body.impulses else np.zeros(0)
+def compile_pushes(body: SceneBody, item: Placed, mass: np.ndarray) -> Iterator[Load]:
+    """Forces and impulses, shared as the points share the `mass` [n] kg."""
     for k, force in enumerate(body.forces):
         ids = item.select(force, f"forces[{k}]")
         each = np.outer(mass[ids] / mass[ids].sum(), force.force)
@@ -143,6 +172,9 @@ def _loads(body: SceneBody, item: _Placed, model: Model) -> Iterator[Load]:
             change = tuple(part / mass[ids].sum() for part in push.impulse)
         each = np.outer(mass[ids], np.asarray(change))
         yield Impulse((item.first + ids).astype(np.int32), each, push.time)
+
+
+def _pressures(body: SceneBody, item: _Tets) -> Iterator[Load]:
     for k, load in enumerate(body.pressures):
         inside = np.zeros(len(item.points), bool)
         inside[item.select(load, f"pressures[{k}]")] = True
@@ -157,7 +189,7 @@ def _loads(body: SceneBody, item: _Placed, model: Model) -> Iterator[Load]:
         yield Pressure(faces + item.first, load.pressure, closed, load.start, end)
 
 
-def _masses(item: _Placed, model: Model) -> np.ndarray:
+def _masses(item: _Tets, model: Model) -> np.ndarray:
     """[n] kg of the body's vertices, a quarter of each element's."""
     (ids,) = [body.tet_range for body in model.bodies if body.name == item.name]
     corners = item.points[item.tets]
@@ -166,7 +198,7 @@ def _masses(item: _Placed, model: Model) -> np.ndarray:
     return np.bincount(item.tets.reshape(-1), weights=np.repeat(mass / 4.0, 4), minlength=len(item.points))
 
 
-def _spring(scene: Scene, k: int, spring: Spring, bodies: dict[str, _Placed]) -> Springs:
+def _spring(scene: Scene, k: int, spring: Spring, bodies: dict[str, _Tets]) -> Springs:
     ends = [_end(f"{scene.name}: springs[{k}].ends[{e}]", end, bodies) for e, end in enumerate(spring.ends)]
     length = spring.rest_length
     if length is None:
@@ -177,7 +209,7 @@ def _spring(scene: Scene, k: int, spring: Spring, bodies: dict[str, _Placed]) ->
 
 
 def _end(
-    where: str, end: SpringEnd, bodies: dict[str, _Placed]
+    where: str, end: SpringEnd, bodies: dict[str, _Tets]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Corners [4], weights [4], anchor [3] m, and where it is at the start [3] m."""
     if end.body is None:
@@ -199,13 +231,13 @@ def _end(
     return corners[0], weights[0], np.zeros(3), point
 
 
-def _carried(body: _Placed, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _carried(body: _Tets, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Corners [n, 4] and weights [n, 4] of the elements that carry points [n, 3] m along."""
     found = embed_surface(body.tetmesh(), points)
     return (body.tets[found.tet_ids] + body.first).astype(np.int32), found.weights.astype(np.float64)
 
 
-def _ties(scene: Scene, k: int, ties: Attachment, bodies: dict[str, _Placed], model: Model) -> Springs:
+def _ties(scene: Scene, k: int, ties: Attachment, bodies: dict[str, _Tets], model: Model) -> Springs:
     a, b = (bodies[name] for name in ties.bodies)
     where = f"{scene.name}: attachments[{k}]"
     ids = np.unique(a.faces)
@@ -259,4 +291,4 @@ def distance_outside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
     return np.where(index.inside(points), 0.0, np.linalg.norm(points - nearest, axis=1))
 
 
-__all__ = ["apply_conditions", "distance_outside"]
+__all__ = ["Placed", "apply_conditions", "chosen_pins", "compile_pushes", "distance_outside"]

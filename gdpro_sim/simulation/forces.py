@@ -10,9 +10,22 @@ from gdpro_sim.simulation.regions import Region
 
 
 class Pin(Region, Moving):
-    """Vertices that are held: where they start, or where keyframes take them."""
+    """Parts that are held: where they start, or where keyframes take them."""
 
+    start: float = Field(
+        default=0.0, ge=0.0, description="s, when they are taken hold of, where they are by then. MPM"
+    )
     release: float | None = Field(default=None, gt=0.0, description="s, when they are let go; default: never")
+
+    @model_validator(mode="after")
+    def _in_time(self) -> Pin:
+        if self.release is not None and self.release <= self.start:
+            raise ValueError(f"release must be after start ({self.start:g} s), got {self.release:g} s")
+        if self.start > 0.0 and self.motion and self.motion[0].time <= self.start:
+            raise ValueError(
+                f"keyframes must be after start ({self.start:g} s), got {self.motion[0].time:g} s"
+            )
+        return self
 
     @model_validator(mode="after")
     def _something(self) -> Pin:

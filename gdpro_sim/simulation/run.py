@@ -24,14 +24,11 @@ class Simulation:
     """
 
     def __init__(self, scene: Scene, assets: dict[str, Asset], *, device: str = "auto") -> None:
-        # The solver is imported here: it compiles kernels, which loading a scene should not.
-        from gdpro_sim.simulation.fem import SolverFEM
-
         self.scene = scene
         self.assets = assets
         self.device = resolve_device(device)
         self.model: Model = compile_scene(scene, assets, device=self.device)
-        self.solver: Solver = SolverFEM(self.model)
+        self.solver = solver_of(self.model)
         self.milliseconds: dict[str, float] = {"solve": 0.0, "resplat": 0.0}
 
     def __len__(self) -> int:
@@ -65,6 +62,18 @@ class Simulation:
         return Frame(index, index / self.scene.fps, bodies, diagnostics)
 
 
+def solver_of(model: Model) -> Solver:
+    """The solver of a model: MPM where it has particles, else FEM. Raises SolverError."""
+    # Solvers are imported here: they compile kernels, which loading a scene should not.
+    if model.particles is not None:
+        from gdpro_sim.simulation.mpm import SolverMPM
+
+        return SolverMPM(model)
+    from gdpro_sim.simulation.fem import SolverFEM
+
+    return SolverFEM(model)
+
+
 def simulate(
     scene: Scene | str | Path,
     *,
@@ -83,4 +92,4 @@ def simulate(
     return Simulation(checked, load_assets(checked, on_progress=on_progress), device=device)
 
 
-__all__ = ["Simulation", "simulate"]
+__all__ = ["Simulation", "simulate", "solver_of"]

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
-from gdpro_sim.simulation.colliders import ColliderOptions, MeshCollider
+from gdpro_sim.simulation.colliders import BoundaryKind, ColliderOptions, MeshCollider
 from gdpro_sim.simulation.forces import (
     AirFlow,
     Attachment,
@@ -25,13 +25,20 @@ from gdpro_sim.simulation.forces import (
     Spring,
     SurfacePressure,
 )
-from gdpro_sim.simulation.model import FemSettings, Integrator
 from gdpro_sim.simulation.options import Options, Vector, several
+from gdpro_sim.simulation.regions import Region
+from gdpro_sim.simulation.solver_options import FemOptions, SolverOptions
 
 log = logging.getLogger(__name__)
 
 STIFFEST = 1.0e7
 """Young's modulus in Pa to which `drop_scene` limits materials."""
+
+
+class Part(Region):
+    """Part of a body that is made of something else."""
+
+    material: Material = Field(description="preset name or values")
 
 
 class SceneBody(Options):
@@ -62,6 +69,9 @@ class SceneBody(Options):
     tets: int = Field(
         default=6_000, ge=50, le=500_000, description="tetrahedra to aim for, where none are cached; roughly"
     )
+    particles: int | None = Field(
+        default=None, ge=1, le=20_000_000, description="of MPM to aim for; default: the solver's, by volume"
+    )
     size: float | None = Field(default=None, gt=0.0, description="longest side of the bounding box, m")
     scale: float = Field(default=1.0, gt=0.0, description="uniform scale, where size is not given")
     anchor: Literal["bottom", "center", "origin"] = Field(
@@ -74,12 +84,15 @@ class SceneBody(Options):
     material: Material | None = Field(
         default=None, description="preset name or values; default: the asset's, else jelly"
     )
+    parts: tuple[Part, ...] = Field(
+        default=(), description="parts of another material, MPM; the last that holds a particle counts"
+    )
     pins: tuple[Pin, ...] = Field(default=(), description="parts held in place, or moved along keyframes")
     forces: tuple[ConstantForce, ...] = Field(default=(), description="constant forces on parts of it")
     impulses: tuple[Push, ...] = Field(default=(), description="pushes at a time")
     pressures: tuple[SurfacePressure, ...] = Field(default=(), description="on parts of its surface")
 
-    @field_validator("pins", "forces", "impulses", "pressures", mode="before")
+    @field_validator("parts", "pins", "forces", "impulses", "pressures", mode="before")
     @classmethod
     def _several(cls, value: Any) -> Any:
         return () if value is None else several(value)
@@ -107,6 +120,10 @@ class GroundPlane(Options):
     """The floor z = height."""
 
     height: float = Field(default=0.0, description="m")
+    boundary: BoundaryKind = Field(
+        default="separate",
+        description="separate (rubs by the bodies' friction), slip or sticky. MPM; FEM knows only separate",
+    )
 
 
 class Camera(Options):
@@ -143,42 +160,6 @@ class Render(Options):
     background: Literal["studio", "white", "black"] = "studio"
 
 
-class SolverOptions(Options):
-    """Settings of the FEM solver; the defaults are converged for the shipped scenes."""
-
-    kind: Literal["fem"] = "fem"
-    integrator: Integrator = Field(
-        default="backward-euler",
-        description="backward-euler; bdf2 or midpoint, which damp less; quasi-static; explicit",
-    )
-    substeps: int = Field(default=2, ge=1, le=1000, description="implicit steps per frame at least")
-    newton_iterations: int = Field(default=60, ge=1, le=1000, description="at most, per substep")
-    newton_tolerance: float = Field(default=1e-3, gt=0.0, description="largest vertex speed correction, m/s")
-    cg_iterations: int = Field(default=2000, ge=1, description="at most, per Newton iteration")
-    cg_tolerance: float = Field(
-        default=1e-2, gt=0.0, lt=1.0, description="relative residual of inner conjugate gradients"
-    )
-    contact_stiffness: float = Field(
-        default=1.0, gt=0.0, description="multiple of the automatic ground stiffness"
-    )
-    volumes: Literal["auto", "nodal", "element"] = Field(
-        default="auto",
-        description="volume changes: averaged around vertices, per element, or by Poisson ratio",
-    )
-    contact_gap: float = Field(
-        default=FemSettings.contact_gap,
-        gt=0.0,
-        lt=0.1,
-        description="distance kept between bodies, as a fraction of the smallest one's size",
-    )
-    body_contact: bool = Field(
-        default=FemSettings.body_contact, description="whether bodies collide with each other"
-    )
-    self_contact: bool = Field(
-        default=FemSettings.self_contact, description="whether bodies collide with themselves"
-    )
-
-
 class Scene(Options):
     """A whole simulation: bodies, world, time, camera and solver. SI units, Z up."""
 
@@ -192,7 +173,7 @@ class Scene(Options):
     seed: int = Field(default=0, ge=0)
     camera: Camera = Field(default_factory=Camera)
     render: Render = Field(default_factory=Render)
-    solver: SolverOptions = Field(default_factory=SolverOptions)
+    solver: SolverOptions = Field(default_factory=FemOptions, description="FEM, or `kind: mpm`")
     colliders: tuple[ColliderOptions, ...] = Field(
         default=(), description="rigid obstacles, at rest or moving; one or several"
     )
@@ -219,6 +200,11 @@ class Scene(Options):
     def _several(cls, value: Any) -> Any:
         return () if value is None else several(value)
 
+    @field_validator("solver", mode="before")
+    @classmethod
+    def _fem_unless_said(cls, value: Any) -> Any:
+        return {"kind": "fem", **value} if isinstance(value, dict) else value
+
     @model_validator(mode="after")
     def _names_known(self) -> Scene:
         used = [
@@ -238,7 +224,7 @@ class Scene(Options):
 
     @model_validator(mode="after")
     def _pushed_in_time(self) -> Scene:
-        if self.solver.integrator == "quasi-static":
+        if isinstance(self.solver, FemOptions) and self.solver.integrator == "quasi-static":
             for body in self.bodies:
                 if body.impulses:
                     raise ValueError(
@@ -455,10 +441,10 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 __all__ = [
     "Camera",
     "GroundPlane",
+    "Part",
     "Render",
     "Scene",
     "SceneBody",
-    "SolverOptions",
     "check_scene",
     "drop_scene",
     "load_scene",

@@ -426,6 +426,7 @@ class SolverFEM:
         Rest surface plus interpolated displacement, so that it is exact at rest.
         """
         item = self.model.bodies[body]
+        assert item.embedding is not None
         begin, end = item.tet_range
         ids = self.model.tets[begin:end][item.embedding.tet_ids]
         displacement = self._state.x.numpy() - self._rest
