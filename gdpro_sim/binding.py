@@ -119,9 +119,21 @@ class BoundGaussians:
         return Gaussians(means, quats, scales, torch.sigmoid(self.opacity_logits.detach()), sh.detach())
 
     def normals(self, vertices: torch.Tensor | None = None) -> torch.Tensor:
-        """Unit normals at each Gaussian, [N, 3]; see `surface_normals`."""
+        """Unit normals at each Gaussian, [N, 3]; see `surface_normals`.
+
+        Vertices that coincide at rest, along cuts of the mesh, count as one: cuts do not show while closed.
+        """
         v = self.vertices if vertices is None else vertices.to(self.device)
-        return surface_normals(v, self.faces, self.face_ids, self.barycentrics)
+        return surface_normals(v, self.faces, self.face_ids, self.barycentrics, self._welded)
+
+    @functools.cached_property
+    def _welded(self) -> torch.Tensor | None:
+        """One vertex for each, [V] int64, the same for those that coincide at rest; None where none do."""
+        rows = np.ascontiguousarray(self.vertices.detach().cpu().numpy()).view(np.dtype((np.void, 12)))
+        _, first, inverse = np.unique(rows.ravel(), return_index=True, return_inverse=True)
+        if len(first) == len(rows):
+            return None
+        return torch.from_numpy(first[inverse]).to(self.device)
 
 
 class TriangleBinding:
@@ -234,14 +246,19 @@ def _groups(owners: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tenso
 
 
 def surface_normals(
-    vertices: torch.Tensor, faces: torch.Tensor, face_ids: torch.Tensor, barycentrics: torch.Tensor
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    face_ids: torch.Tensor,
+    barycentrics: torch.Tensor,
+    welded: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Unit normals [N, 3] at points of a mesh: vertex normals interpolated, face normals along sharp edges.
 
     A corner whose vertex normal leaves the face's by 45 degrees or more counts as sharp, by less than 25 as
-    smooth; in between the two are mixed, so that nothing jumps while a body deforms.
+    smooth; in between the two are mixed, so that nothing jumps while a body deforms. `welded` as in
+    `vertex_normals`.
     """
-    per_vertex, per_face = vertex_normals(vertices, faces), face_normals(vertices, faces)
+    per_vertex, per_face = vertex_normals(vertices, faces, welded), face_normals(vertices, faces)
     corners = per_vertex[faces.long()]
     cosine = (corners * per_face[:, None]).sum(2, keepdim=True)
     smooth = ((cosine - 0.7072) / 0.2).clamp(0.0, 1.0)
@@ -256,14 +273,18 @@ def face_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.normalize(normals, dim=1, eps=1e-30)
 
 
-def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+def vertex_normals(
+    vertices: torch.Tensor, faces: torch.Tensor, welded: torch.Tensor | None = None
+) -> torch.Tensor:
     """Unit vertex normals [V, 3]: face normals weighted by their angle at the vertex; zero without area.
 
+    Vertices with the same number in `welded` [V], numbers of vertices, share the faces around all of them.
     Angle weights do not depend on how a flat region is cut into triangles (Thuermer & Wuethrich, Journal of
     Graphics Tools 3(1), 1998).
     """
     corners = vertices.double()[faces.long()]
     normals = face_normals(vertices.double(), faces)
+    owners = faces.long() if welded is None else welded[faces.long()]
     total = torch.zeros((3, len(vertices)), dtype=torch.float64, device=vertices.device)
     for k in range(3):
         a = torch.nn.functional.normalize(corners[:, (k + 1) % 3] - corners[:, k], dim=1, eps=1e-300)
@@ -271,8 +292,9 @@ def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
         angle = torch.acos((a * b).sum(1).clamp(-1.0, 1.0))
         for axis in range(3):
             # on a CPU bincount adds up faster than index_add_
-            total[axis] += torch.bincount(faces[:, k].long(), angle * normals[:, axis], len(vertices))
-    return torch.nn.functional.normalize(total.T, dim=1, eps=1e-300).to(vertices.dtype)
+            total[axis] += torch.bincount(owners[:, k], angle * normals[:, axis], len(vertices))
+    unit = torch.nn.functional.normalize(total.T, dim=1, eps=1e-300).to(vertices.dtype)
+    return unit if welded is None else unit[welded]
 
 
 @functools.cache
