@@ -146,21 +146,21 @@ _GROUP = f"""
     typedef double D;
     auto wide = [](F v) {{ return (double)v; }};
     auto narrow = [](D v) {{ return (float)v; }};
-    auto row = [&](int r) {{ return particles.data[(size_t)r * count + first]; }};
-    auto put = [&](int r, F v) {{ particles.data[(size_t)r * count + first] = v; }};
+    auto row = [&](int r) {{ return particles.data[(size_t)r * particles.shape[1] + first]; }};
+    auto put = [&](int r, F v) {{ particles.data[(size_t)r * particles.shape[1] + first] = v; }};
 #else
     typedef double D __attribute__((ext_vector_type({LANES})));
     auto wide = [](F v) {{ return __builtin_convertvector(v, D); }};
     auto narrow = [](D v) {{ return __builtin_convertvector(v, F); }};
     auto row = [&](int r) {{
-        const float* const p = particles.data + (size_t)r * count + first;
+        const float* const p = particles.data + (size_t)r * particles.shape[1] + first;
         F v;
         if (lanes == {LANES}) {{ __builtin_memcpy(&v, p, sizeof(F)); return v; }}
         for (int j = 0; j < {LANES}; ++j) v[j] = p[j < lanes ? j : lanes - 1];
         return v;
     }};
     auto put = [&](int r, F v) {{
-        float* const p = particles.data + (size_t)r * count + first;
+        float* const p = particles.data + (size_t)r * particles.shape[1] + first;
         if (lanes == {LANES}) {{ __builtin_memcpy(p, &v, sizeof(F)); return; }}
         for (int j = 0; j < lanes; ++j) p[j] = v[j];
     }};
@@ -169,6 +169,18 @@ _GROUP = f"""
 """Opens a snippet: rows of a group's particles, and double vectors D."""
 
 _MATH = """
+    // 1 / sqrt(v) to an ulp or two, v > 0.
+    auto rsqrt_ = [&](F v) {
+#if defined(__CUDACC__)
+        return rsqrtf(v);
+#elif defined(__AVX512F__)
+        const F y = (F)__builtin_ia32_rsqrt14ps512_mask(v, v, (unsigned short)0xffff);
+        const F r = 1.0f - v * y * y;
+        return y + y * r * (0.5f + 0.375f * r);
+#else
+        return 1.0f / sqrt_(v);
+#endif
+    };
     // log u, where x = u - 1 is known better than u.
     auto log_of = [&](F u, F x) {
         const I shifted = bits_of(u) - 0x3f3504f3;
@@ -195,6 +207,38 @@ _MATH = """
         return power * (p * r) + (power - 1.0f);
     };
     auto exp_ = [&](F x) { return expm1_(x) + 1.0f; };
+    // Angle of the point (x, y), y >= 0.
+    auto angle_ = [&](F y, F x) {
+        const F a = abs_(x), high = max_(a, y), low = min_(a, y);
+        const F t = low / select(high > 0.0f, high, splat(1.0f)), q = t * t;
+        F p = q * 0.0028340643f - 0.016005031f;
+        p = p * q + 0.042587608f;
+        p = p * q - 0.074954454f;
+        p = p * q + 0.10636754f;
+        p = p * q - 0.14202571f;
+        p = p * q + 0.19992484f;
+        p = p * q - 0.33333067f;
+        const F first = t + t * q * p;
+        const F steep = select(y > a, 1.5707963f - first, first);
+        return select(x < 0.0f, 3.1415927f - steep, steep);
+    };
+    // Of angles from 0 to 60 degrees.
+    auto cos_ = [&](F x) {
+        const F q = x * x;
+        F p = q * -2.7557319e-7f + 2.4801587e-5f;
+        p = p * q - 1.3888889e-3f;
+        p = p * q + 4.1666667e-2f;
+        p = p * q - 0.5f;
+        return p * q + 1.0f;
+    };
+    auto sin_ = [&](F x) {
+        const F q = x * x;
+        F p = q * -2.5052108e-8f + 2.7557319e-6f;
+        p = p * q - 1.9841270e-4f;
+        p = p * q + 8.3333333e-3f;
+        p = p * q - 0.16666667f;
+        return x + x * (p * q);
+    };
 """
 
 _DEGENERATE = f"""
@@ -276,21 +320,19 @@ _BEGIN = """
     // b - 1 and J - 1.
     D f[9];
     for (int i = 0; i < 9; ++i) f[i] = wide(row(DEFORMATION + i)) + wide(row(DEFORMATION_LOW + i));
-    F b00, b11, b22, b01, b02, b12, d;
-    {
-        D g[9];
-        for (int i = 0; i < 9; ++i) g[i] = i % 4 == 0 ? f[i] - 1.0 : f[i];
-        b00 = narrow(g[0] + g[0] + g[0] * g[0] + g[1] * g[1] + g[2] * g[2]);
-        b11 = narrow(g[4] + g[4] + g[3] * g[3] + g[4] * g[4] + g[5] * g[5]);
-        b22 = narrow(g[8] + g[8] + g[6] * g[6] + g[7] * g[7] + g[8] * g[8]);
-        b01 = narrow(g[1] + g[3] + g[0] * g[3] + g[1] * g[4] + g[2] * g[5]);
-        b02 = narrow(g[2] + g[6] + g[0] * g[6] + g[1] * g[7] + g[2] * g[8]);
-        b12 = narrow(g[5] + g[7] + g[3] * g[6] + g[4] * g[7] + g[5] * g[8]);
-        const D m0 = g[4] * g[8] - g[5] * g[7], m1 = g[3] * g[8] - g[5] * g[6];
-        const D m2 = g[3] * g[7] - g[4] * g[6];
-        const D minors = m0 + (g[0] * g[4] - g[1] * g[3]) + (g[0] * g[8] - g[2] * g[6]);
-        d = narrow(g[0] + g[4] + g[8] + minors + (g[0] * m0 - g[1] * m1 + g[2] * m2));
-    }
+    D g[9];
+    for (int i = 0; i < 9; ++i) g[i] = i % 4 == 0 ? f[i] - 1.0 : f[i];
+    const D w00 = g[0] + g[0] + g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+    const D w11 = g[4] + g[4] + g[3] * g[3] + g[4] * g[4] + g[5] * g[5];
+    const D w22 = g[8] + g[8] + g[6] * g[6] + g[7] * g[7] + g[8] * g[8];
+    const D w01 = g[1] + g[3] + g[0] * g[3] + g[1] * g[4] + g[2] * g[5];
+    const D w02 = g[2] + g[6] + g[0] * g[6] + g[1] * g[7] + g[2] * g[8];
+    const D w12 = g[5] + g[7] + g[3] * g[6] + g[4] * g[7] + g[5] * g[8];
+    const F b00 = narrow(w00), b11 = narrow(w11), b22 = narrow(w22);
+    const F b01 = narrow(w01), b02 = narrow(w02), b12 = narrow(w12);
+    const D m0 = g[4] * g[8] - g[5] * g[7], m1 = g[3] * g[8] - g[5] * g[6], m2 = g[3] * g[7] - g[4] * g[6];
+    const D minors = m0 + (g[0] * g[4] - g[1] * g[3]) + (g[0] * g[8] - g[2] * g[6]);
+    const F d = narrow(g[0] + g[4] + g[8] + minors + (g[0] * m0 - g[1] * m1 + g[2] * m2));
     F J = d + 1.0f;
 
     // Velocity gradient, where something looks at it.
@@ -344,48 +386,34 @@ _BEGIN = """
     }
 """
 
-_ROTATE = """
-            {{
-                const F gap = a{q}{q} - a{p}{p}, twice = 2.0f * a{pq};
-                const F size = abs_(gap) + sqrt_(gap * gap + twice * twice);
-                const F up = twice / select(size > 0.0f, size, one);
-                const F t = select(gap < 0.0f, -up, up);
-                const F cos = 1.0f / sqrt_(1.0f + t * t), sin = t * cos;
-                a{p}{p} -= t * a{pq};
-                a{q}{q} += t * a{pq};
-                a{pq} = zero;
-                const F low = cos * a{pk} - sin * a{qk};
-                a{qk} = sin * a{pk} + cos * a{qk};
-                a{pk} = low;
-                for (int i = 0; i < 3; ++i) {{
-                    const F v = cos * q{p}[i] - sin * q{q}[i];
-                    q{q}[i] = sin * q{p}[i] + cos * q{q}[i];
-                    q{p}[i] = v;
-                }}
-            }}
-"""
-
 _PRINCIPAL = f"""
     if (any(principal)) {{
-        // Eigenvectors of b - 1 by cyclic Jacobi sweeps.
-        F a00 = b00, a11 = b11, a22 = b22, a01 = b01, a02 = b02, a12 = b12;
-        F q0[3] = {{one, zero, zero}}, q1[3] = {{zero, one, zero}}, q2[3] = {{zero, zero, one}};
-        for (int sweep = 0; sweep < 6; ++sweep) {{
-            const F off = a01 * a01 + a02 * a02 + a12 * a12;
-            if (!any(principal & (off > 1.0e-14f * (a00 * a00 + a11 * a11 + a22 * a22)))) break;
-            {_ROTATE.format(p=0, q=1, k=2, pq="01", pk="02", qk="12")}
-            {_ROTATE.format(p=0, q=2, k=1, pq="02", pk="01", qk="12")}
-            {_ROTATE.format(p=1, q=2, k=0, pq="12", pk="01", qk="02")}
-        }}
-        const F floor = splat(-1.0f + 1.0e-6f);
-        F x[3] = {{max_(a00, floor), max_(a11, floor), max_(a22, floor)}};
-        F s[3], g[3], t[3], back[3] = {{zero, zero, zero}};  // back: s_new / s - 1
+        // Eigenvalues x of b - 1 by Cardano's formula; the discriminant and the scale are float64.
+        const D third = (w00 + w11 + w22) * (1.0 / 3.0);
+        const D v00 = w00 - third, v11 = w11 - third, v22 = w22 - third;
+        const D square = (v00 * v00 + v11 * v11 + v22 * v22
+            + 2.0 * (w01 * w01 + w02 * w02 + w12 * w12)) * (1.0 / 6.0);
+        const D half = 0.5 * (v00 * (v11 * v22 - w12 * w12) - w01 * (w01 * v22 - w12 * w02)
+            + w02 * (w01 * w12 - v11 * w02));
+        const F radius2 = narrow(square);
+        const I spreads = radius2 > 1.0e-36f;
+        const F inverse = select(spreads, rsqrt_(select(spreads, radius2, one)), zero);
+        const D scale = wide(inverse) * wide(inverse) * wide(inverse);
+        const D cosine = half * scale;
+        const F sine2 = narrow(square * square * square * scale * scale - cosine * cosine);
+        const F angle = angle_(sqrt_(max_(sine2, zero)), narrow(cosine)) * (1.0f / 3.0f);
+        const F radius = radius2 * inverse, mean = narrow(third);
+        const F along = radius * cos_(angle), across = 1.7320508f * radius * sin_(angle);
+        const F y[3] = {{along + along, across - along, -across - along}};
+        F x[3];
+        for (int i = 0; i < 3; ++i) x[i] = max_(mean + y[i], splat(-1.0f + 1.0e-6f));
+        F s[3], rise[3], t[3], back[3] = {{zero, zero, zero}};  // rise: s - 1, back: s_new / s - 1
         for (int i = 0; i < 3; ++i) {{
             s[i] = sqrt_(x[i] + 1.0f);
-            g[i] = x[i] / (s[i] + 1.0f);
-            t[i] = select(corotated, 2.0f * mu * s[i] * g[i], mu * x[i]) + pressure;
+            rise[i] = x[i] / (s[i] + 1.0f);
+            t[i] = select(corotated, 2.0f * mu * s[i] * rise[i], mu * x[i]) + pressure;
         }}
-        const F widest = max_(max_(x[0], x[1]), x[2]);
+        const F widest = x[0];
         const F shear = select(corotated, mu + mu, mu) * (1.0f + widest);
         stiff = select((neo | stable | corotated), stiff + shear, stiff);
         I flows = zero > 1.0f;
@@ -451,10 +479,10 @@ _PRINCIPAL = f"""
             const F low = -constant(A), high = constant(B);
             F kept[3], r[3];
             for (int i = 0; i < 3; ++i) {{
-                kept[i] = max_(min_(g[i], high), low);
-                r[i] = (g[i] - kept[i]) / (kept[i] + 1.0f);
-                back[i] = select(snow, (kept[i] - g[i]) / s[i], back[i]);
-                flows = flows | (snow & (kept[i] != g[i]));
+                kept[i] = max_(min_(rise[i], high), low);
+                r[i] = (rise[i] - kept[i]) / (kept[i] + 1.0f);
+                back[i] = select(snow, (kept[i] - rise[i]) / s[i], back[i]);
+                flows = flows | (snow & (kept[i] != rise[i]));
             }}
             const F known = narrow(memory);
             const F after = known + (1.0f + known) * PRODUCT(r);
@@ -485,27 +513,44 @@ _PRINCIPAL = f"""
             put(INTERNAL + 2, select(tears, damage, row(INTERNAL + 2)));
         }}
 
-        const int first_of[6] = {{0, 1, 2, 0, 0, 1}}, second_of[6] = {{0, 1, 2, 1, 2, 2}};
-        for (int m = 0; m < 6; ++m) {{
-            const int i = first_of[m], j = second_of[m];
-            const F sum = t[0] * q0[i] * q0[j] + t[1] * q1[i] * q1[j] + t[2] * q2[i] * q2[j];
-            tau[m] = select(principal, sum, tau[m]);
-        }}
+        // A function of the principal values is a polynomial of v = b - 1 - mean: Newton's, by differences.
+        const F g00 = narrow(v00), g11 = narrow(v11), g22 = narrow(v22), g01 = b01, g02 = b02, g12 = b12;
+        const F s00 = g00 * g00 + g01 * g01 + g02 * g02, s11 = g01 * g01 + g11 * g11 + g12 * g12;
+        const F s22 = g02 * g02 + g12 * g12 + g22 * g22, s01 = g00 * g01 + g01 * g11 + g02 * g12;
+        const F s02 = g00 * g02 + g01 * g12 + g02 * g22, s12 = g01 * g02 + g11 * g12 + g12 * g22;
+        const F span = y[0] - y[2], gap = (y[1] - y[2]) * (y[1] - y[0]);
+        const F per_span = select(span > 0.0f, 1.0f / span, zero);
+        const F per_gap = select(gap < -1.0e-7f * span * span, 1.0f / gap, zero);
+        auto spread = [&](const F* value, F* out) {{
+            const F slope = (value[0] - value[2]) * per_span;
+            const F bend = ((value[1] - value[2]) - slope * (y[1] - y[2])) * per_gap;
+            const F linear = slope - bend * (y[0] + y[2]);
+            const F constant = value[2] - slope * y[2] + bend * (y[0] * y[2]);
+            out[0] = constant + linear * g00 + bend * s00;
+            out[1] = constant + linear * g11 + bend * s11;
+            out[2] = constant + linear * g22 + bend * s22;
+            out[3] = linear * g01 + bend * s01;
+            out[4] = linear * g02 + bend * s02;
+            out[5] = linear * g12 + bend * s12;
+        }};
+        F whole[6];
+        spread(t, whole);
+        for (int i = 0; i < 6; ++i) tau[i] = select(principal, whole[i], tau[i]);
         if (any(flows)) {{
-            F M[9];
-            for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j)
-                    M[3 * i + j] = back[0] * q0[i] * q0[j] + back[1] * q1[i] * q1[j]
-                        + back[2] * q2[i] * q2[j];
-            for (int i = 0; i < 3; ++i)
-                for (int j = 0; j < 3; ++j) {{
-                    const F more = M[3 * i] * narrow(f[j]) + M[3 * i + 1] * narrow(f[3 + j])
-                        + M[3 * i + 2] * narrow(f[6 + j]);
-                    const D sum = f[3 * i + j] + wide(select(flows, more, zero));
+            // F grows by (Q diag(back) Q^T) F.
+            F more[6];
+            spread(back, more);
+            const F M[9] = {{more[0], more[3], more[4], more[3], more[1], more[5], more[4], more[5], more[2]}};
+            for (int j = 0; j < 3; ++j) {{
+                const F column[3] = {{narrow(f[j]), narrow(f[3 + j]), narrow(f[6 + j])}};
+                for (int i = 0; i < 3; ++i) {{
+                    const F step = M[3 * i] * column[0] + M[3 * i + 1] * column[1] + M[3 * i + 2] * column[2];
+                    const D sum = f[3 * i + j] + wide(select(flows, step, zero));
                     const F high = narrow(sum);
                     put(DEFORMATION + 3 * i + j, high);
                     put(DEFORMATION_LOW + 3 * i + j, narrow(sum - wide(high)));
                 }}
+            }}
         }}
     }}
 """
