@@ -119,6 +119,9 @@ def simulate(
     if json_output:
         print(json.dumps(recording.to_json()))
     elif not quiet:
+        inside = f"{recording.tets:,} tetrahedra"
+        if recording.particles:
+            inside = f"{recording.particles:,} particles"
         rows = [("asset", str(path)) for path in recording.assets]
         rows += [
             ("simulation", str(recording.simulation)),
@@ -129,7 +132,7 @@ def simulate(
                 "frames",
                 f"{recording.frames}  ({recording.frame_count}, {recording.resumed_frames} of them resumed)",
             ),
-            ("size", f"{recording.gaussians:,} Gaussians, {recording.tets:,} tetrahedra"),
+            ("size", f"{recording.gaussians:,} Gaussians, {inside}"),
             ("seconds", "  ".join(f"{phase} {value:.1f}" for phase, value in recording.seconds.items())),
         ]
         table(f"Simulation of {checked.name}", rows)

@@ -9,12 +9,8 @@ from __future__ import annotations
 import csv
 import glob
 import hashlib
-import json
-import logging
 import os
-import shutil
 import time
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,7 +23,7 @@ import warp as wp
 import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device, serial_torch
-from gdpro_sim.errors import OutputError, RequestError
+from gdpro_sim.errors import RequestError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
 from gdpro_sim.io.images import (
     frame_name,
@@ -40,20 +36,26 @@ from gdpro_sim.io.images import (
 )
 from gdpro_sim.io.obstacles import Obstacles, with_obstacles
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
+from gdpro_sim.io.resume import Store, StoredFrame
 from gdpro_sim.io.usd import SimulationWriter, body_records
 from gdpro_sim.simulation.compile import check_files, load_assets
 from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.model import Diagnostics
+from gdpro_sim.simulation.placement import material_of
 from gdpro_sim.simulation.run import Simulation
 from gdpro_sim.simulation.scene import Scene, SceneBody, load_scene
-
-logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 """Called with (phase, done, total); total 0 means the length is not known."""
 
-RESUME_FORMAT = 1
+RESUME_FORMAT = 2
 """Raise it when frames of an earlier version must not be continued."""
+
+ELSEWHERE: dict[str, tuple[str, ...]] = {
+    "fem": (),
+    "mpm": ("newton_iterations", "cg_iterations", "residual", "converged", "force_energy"),
+}
+"""Figures that mean nothing for a solver: its metrics leave them out."""
 
 PHASES = ("solve", "resplat", "render", "write")
 
@@ -73,6 +75,7 @@ class Recording:
     resumed_frames: int
     gaussians: int
     tets: int
+    particles: int
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -115,7 +118,7 @@ def record(
     frames = prepare_folder(folder / "frames", frame_name(0))
     remove_stale(folder)
     remove_stale(frames)
-    store = _Store(folder / ".resume", _fingerprint(checked, device), fresh)
+    store = Store(folder / ".resume", _fingerprint(checked, device), fresh)
 
     begin = time.perf_counter()
     report("prepare", 0, 0)
@@ -147,6 +150,7 @@ def record(
     )
     seconds["video"] = time.perf_counter() - begin
     store.finish()
+    model = simulation.model
     return Recording(
         output=folder,
         assets=asset_paths,
@@ -157,8 +161,9 @@ def record(
         metrics=folder / "metrics.csv",
         frame_count=len(simulation),
         resumed_frames=store.resumed,
-        gaussians=sum(len(a.gaussians) for a in assets.values()),
-        tets=len(simulation.model.tets),
+        gaussians=sum(len(body.gaussians) for body in model.bodies),
+        tets=len(model.tets),
+        particles=0 if model.particles is None else len(model.particles),
         seconds={k: round(v, 3) for k, v in seconds.items()},
     )
 
@@ -166,7 +171,7 @@ def record(
 def _run(
     simulation: Simulation,
     folder: Path,
-    store: _Store,
+    store: Store,
     renderer: Renderer,
     obstacles: Obstacles,
     preview: dict[str, Any],
@@ -197,8 +202,9 @@ def _run(
                 surfaces, diagnostics = simulation.surfaces(), simulation.solver.diagnostics()
                 solved = simulation.milliseconds["solve"]
             else:
-                surfaces, diagnostics, solved, state = stored
-                simulation.solver.load_state_dict(state)
+                surfaces, diagnostics, solved = stored.surfaces, stored.diagnostics, stored.solve
+                if index == store.resumed - 1:
+                    simulation.solver.load_state_dict(store.state())
             frame = simulation.frame(index, surfaces, diagnostics)
 
             begin = time.perf_counter()
@@ -212,7 +218,8 @@ def _run(
                 write_png(path, picture)
             writer.add(frame)
             if stored is None:
-                store.save(index, surfaces, diagnostics, solved, simulation.solver.state_dict())
+                done = StoredFrame(surfaces, diagnostics, solved)
+                store.save(index, done, simulation.solver.state_dict())
             written = time.perf_counter()
             milliseconds = {
                 "solve": solved,
@@ -220,7 +227,7 @@ def _run(
                 "render": 1e3 * (drawn - begin),
                 "write": 1e3 * (written - drawn),
             }
-            rows.append(_row(index, diagnostics, milliseconds))
+            rows.append(_row(index, diagnostics, milliseconds, ELSEWHERE[scene.solver.kind]))
             report("simulate", index + 1, total)
         report("usd", 0, 0)
         begin = time.perf_counter()
@@ -243,7 +250,9 @@ def _read_all(pictures: list[Path], report: Progress) -> Iterator[np.ndarray]:
         yield read_png(path)
 
 
-def _row(index: int, diagnostics: Diagnostics, milliseconds: dict[str, float]) -> dict[str, Any]:
+def _row(
+    index: int, diagnostics: Diagnostics, milliseconds: dict[str, float], left_out: tuple[str, ...]
+) -> dict[str, Any]:
     """One line of metrics.csv: figures of the solver, then wall milliseconds per phase."""
     row: dict[str, Any] = {"frame": index}
     units = {
@@ -252,6 +261,8 @@ def _row(index: int, diagnostics: Diagnostics, milliseconds: dict[str, float]) -
         "max_penetration": "max_penetration_m", "force_energy": "force_energy_J",
     }  # fmt: skip
     for key, value in asdict(diagnostics).items():
+        if key in left_out:
+            continue
         if key in ("momentum", "angular_momentum"):
             unit = "kg_m_per_s" if key == "momentum" else "kg_m2_per_s"
             row.update(
@@ -275,7 +286,7 @@ def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray
     boxes = []
     for body, placed in zip(scene.bodies, simulation.model.bodies, strict=True):
         low, high = placed.surface.min(axis=0).astype(float), placed.surface.max(axis=0).astype(float)
-        friction = float(simulation.model.friction[placed.vertex_range[0]])
+        friction = material_of(body, simulation.assets[body.name]).friction
         for shift in _path(scene, body, low, float((high - low).max()), friction):
             boxes.append((low + shift, high + shift))
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
@@ -349,98 +360,6 @@ def _keep_inputs(scene: Scene, outputs: list[Path]) -> None:
             raise RequestError(
                 f"the results would overwrite {path}, which the scene reads; choose another output folder"
             )
-
-
-class _Store:
-    """Finished frames of a run that is not complete yet."""
-
-    def __init__(self, folder: Path, fingerprint: str, fresh: bool) -> None:
-        self.folder = folder
-        self.resumed = 0
-        self._open = True
-        marker = folder / "run.json"
-        known: dict[str, Any] = {}
-        try:
-            read = json.loads(marker.read_text(encoding="utf-8"))
-            known = read if isinstance(read, dict) else {}
-        except (OSError, ValueError):
-            pass
-        self._assets: dict[str, str] = {}
-        if fresh or known.get("fingerprint") != fingerprint:
-            if not fresh and known:
-                logger.warning(
-                    "%s holds a stopped run of another scene, device or version: starting anew", folder.parent
-                )
-            shutil.rmtree(folder, ignore_errors=True)
-        else:
-            self._assets = dict(known.get("assets", {}))
-        self._fingerprint = fingerprint
-        prepare_folder(folder, "run.json")
-        self._write_marker()
-
-    def _write_marker(self) -> None:
-        with atomic_write(self.folder / "run.json") as temporary:
-            temporary.write_text(
-                json.dumps({"fingerprint": self._fingerprint, "assets": self._assets}), encoding="utf-8"
-            )
-
-    def has_assets(self, paths: list[Path]) -> bool:
-        """Whether the asset files are the ones this run wrote."""
-        return bool(self._assets) and all(
-            p.is_file() and self._assets.get(p.name) == sha256_of(p) for p in paths
-        )
-
-    def assets_saved(self, paths: list[Path]) -> None:
-        """Tets are not repeatable: frames of other assets are of no use."""
-        for old in self.folder.glob("frame_*.npz"):
-            old.unlink()
-        self._assets = {p.name: sha256_of(p) for p in paths}
-        self._write_marker()
-
-    def load(self, index: int) -> tuple[list[np.ndarray], Diagnostics, float, dict[str, np.ndarray]] | None:
-        """A finished frame: surfaces, diagnostics, milliseconds, solver state; None where it is missing."""
-        path = self.folder / f"frame_{index:05d}.npz"
-        if not self._open or not path.exists():
-            self._open = False
-            return None
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                surfaces = [
-                    data[f"surface.{k}"] for k in range(sum(n.startswith("surface.") for n in data.files))
-                ]
-                state = {n.removeprefix("state."): data[n] for n in data.files if n.startswith("state.")}
-                figures = json.loads(str(data["figures"]))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            logger.warning("%s cannot be read (%s); continuing from the frame before it", path, error)
-            self._open = False
-            return None
-        figures["diagnostics"] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in figures["diagnostics"].items()
-        }
-        self.resumed = index + 1
-        return surfaces, Diagnostics(**figures["diagnostics"]), figures["solve"], state
-
-    def save(
-        self,
-        index: int,
-        surfaces: list[np.ndarray],
-        diagnostics: Diagnostics,
-        solve: float,
-        state: dict[str, np.ndarray],
-    ) -> None:
-        figures = json.dumps({"diagnostics": asdict(diagnostics), "solve": solve})
-        arrays = {f"surface.{k}": s for k, s in enumerate(surfaces)} | {
-            f"state.{k}": v for k, v in state.items()
-        }
-        with atomic_write(self.folder / f"frame_{index:05d}.npz") as temporary:
-            np.savez(temporary, figures=np.array(figures), **arrays)  # type: ignore[arg-type]
-
-    def finish(self) -> None:
-        """The run is complete: nothing is left to resume."""
-        try:
-            shutil.rmtree(self.folder)
-        except OSError as error:
-            raise OutputError(f"{self.folder} cannot be removed: {error.strerror or error}") from None
 
 
 __all__ = ["Recording", "record"]

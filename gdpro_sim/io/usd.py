@@ -64,10 +64,13 @@ def body_records(model: Model, assets: Mapping[str, Asset]) -> tuple[BodyRecord,
     records = []
     for body in model.bodies:
         asset = assets[body.name]
+        colors = asset.vertex_colors if body.patches is None else body.vertex_colors
         (v0, v1), (t0, t1) = body.vertex_range, body.tet_range
-        method = asset.tets.method if asset.tets is not None else "tetwild"
-        tets = TetMesh(model.vertices[v0:v1], model.tets[t0:t1] - np.int32(v0), model.fill[t0:t1], method)
-        records.append(BodyRecord(body.name, body.gaussians, asset.vertex_colors, tets, asset.material))
+        tets = None
+        if t1 > t0:
+            method = asset.tets.method if asset.tets is not None else "tetwild"
+            tets = TetMesh(model.vertices[v0:v1], model.tets[t0:t1] - np.int32(v0), model.fill[t0:t1], method)
+        records.append(BodyRecord(body.name, body.gaussians, colors, tets, asset.material))
     return tuple(records)
 
 
