@@ -79,9 +79,9 @@ _WEIGHTS = """
             f[a] = u - base[a];
             const F l = 2.0f - f[a], r = f[a] - 1.0f;
             w[0] = l * l * l * (1.0f / 6.0f);
-            w[1] = (0.5f * r - 1.0f) * r * r + (2.0f / 3.0f);
-            w[2] = (0.5f * l - 1.0f) * l * l + (2.0f / 3.0f);
             w[3] = r * r * r * (1.0f / 6.0f);
+            w[2] = (0.5f * l - 1.0f) * l * l + (2.0f / 3.0f);
+            w[1] = ((1.0f - w[0]) - w[3]) - w[2];  // they sum to 1 in the mean: momentum is kept
         }
     }
     // Where they begin in the tile; a particle that strayed too far stays in it, and is reported.
@@ -525,9 +525,9 @@ def spline_weights(x: wp.vec3, inverse: float, width: int):
             left = 2.0 - t
             right = t - 1.0
             w[a, 0] = left * left * left / 6.0
-            w[a, 1] = (0.5 * right - 1.0) * right * right + 2.0 / 3.0
-            w[a, 2] = (0.5 * left - 1.0) * left * left + 2.0 / 3.0
             w[a, 3] = right * right * right / 6.0
+            w[a, 2] = (0.5 * left - 1.0) * left * left + 2.0 / 3.0
+            w[a, 1] = ((1.0 - w[a, 0]) - w[a, 3]) - w[a, 2]
     return base, f, w
 
 

@@ -12,6 +12,7 @@ from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import Embedding
 from gdpro_sim.simulation.colliders import BoundaryKind, Collider
 from gdpro_sim.simulation.conditions import Hold, Load, Motion, Springs
+from gdpro_sim.simulation.mujoco_model import MujocoWorld
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,7 @@ class Particles:
     matter:     [N] int32, number of the particle's material in `materials`
     materials:  what the particles are made of; as many as there are different ones
     spacing:    m, distance between neighbours: the cube root of a particle's volume
+    gradients:  [N, 3, 3] float32 1/s, velocity gradients: of a body that spins, the matrix of w x; None: zero
     """
 
     positions: np.ndarray
@@ -110,6 +112,7 @@ class Particles:
     matter: np.ndarray
     materials: tuple[Material, ...]
     spacing: float
+    gradients: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -130,6 +133,15 @@ class MpmSettings:
     max_substeps:  substeps per `step(dt)` past which the solver refuses
     domain:        (low, high) corners of a closed box, m, that particles cannot leave; None: no walls
     max_cells:     cells of the grid's bounding box past which the solver refuses
+
+    "implicit" alone, for which `cfl` bounds what moves at particle speed:
+
+    substeps:          substeps per `step(dt)` at least; one that fails is halved by the solver
+    newton_iterations: most projected-Newton iterations in one substep before it counts as failed
+    newton_tolerance:  m/s; stop when a full Newton step changes no node's velocity by more, lighter nodes
+                       counting by the root of their mass
+    cg_iterations:     most inner conjugate gradient iterations per Newton iteration
+    cg_tolerance:      relative (preconditioned) residual of the inner conjugate gradients
     """
 
     integrator: Literal["explicit", "implicit"] = "explicit"
@@ -141,6 +153,11 @@ class MpmSettings:
     max_substeps: int = 20_000
     domain: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     max_cells: int = 1 << 31
+    substeps: int = 2
+    newton_iterations: int = 60
+    newton_tolerance: float = 1e-3
+    cg_iterations: int = 2000
+    cg_tolerance: float = 1e-2
 
 
 @dataclass(frozen=True)
@@ -161,6 +178,7 @@ class Model:
     law:         [T] int32 constitutive law, a number of `gdpro_sim.materials.LAWS`; None: stable neo-Hookean
     yield_stress, hardening: [T] Pa, of elements with the law "stvk_hencky"; inf does not yield; None: none do
     particles:   material points of the bodies that MPM simulates; None: FEM simulates tets
+    mujoco:      rigid and soft bodies that MuJoCo simulates, in the order of `bodies`; None: others simulate
     """
 
     bodies: tuple[Body, ...]
@@ -191,6 +209,7 @@ class Model:
     particles: Particles | None = None
     holds: tuple[Hold, ...] = ()
     mpm: MpmSettings = MpmSettings()
+    mujoco: MujocoWorld | None = None
 
     @staticmethod
     def of_particles(

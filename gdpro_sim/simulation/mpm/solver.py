@@ -1,4 +1,4 @@
-"""The material point method in time: explicit substeps as short as sound and particles ask for."""
+"""The material point method in time: explicit substeps as short as sound asks for, or implicit ones."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from gdpro_sim.kernels import particles as rows
 from gdpro_sim.simulation.model import Diagnostics, Model, Particles
 from gdpro_sim.simulation.mpm.boundaries import boundaries
 from gdpro_sim.simulation.mpm.grid import Grid
+from gdpro_sim.simulation.mpm.implicit import GridNewton
 from gdpro_sim.simulation.mpm.matter import Matter
 
 
@@ -22,10 +23,18 @@ from gdpro_sim.simulation.mpm.matter import Matter
 class _Counters:
     substeps: int = 0
     sorts: int = 0
+    newton_iterations: int = 0
+    cg_iterations: int = 0
+    converged: bool = True
+    residual: float = 0.0
+
+
+HALVINGS = 5
+"""Times that an implicit substep which fails is halved."""
 
 
 class SolverMPM:
-    """Explicit MLS-MPM for a compiled `Model`; implements `gdpro_sim.simulation.model.Solver`.
+    """MLS-MPM for a compiled `Model`, explicit or implicit; implements `gdpro_sim.simulation.model.Solver`.
 
     Particles and grid are float32; positions and deformations keep what rounding cuts off, so that slow
     motion and small strains are not lost in short substeps. On the CPU results are the same bytes for any
@@ -55,7 +64,10 @@ class SolverMPM:
         self.boundaries = boundaries(model)
         self._affine = 0.0 if settings.transfer == "pic" else 1.0
         self._flip = settings.flip_ratio if settings.transfer == "flip" else 0.0
+        self._newton = None
         self._viscous_step = self.matter.largest_step(self.spacing)
+        if settings.integrator == "implicit":
+            self._newton = GridNewton(self.grid, particles, self.matter, self.boundaries, settings)
         self._time = 0.0
         self._counters = _Counters()
         self._others = {
@@ -136,17 +148,18 @@ class SolverMPM:
         self.grid.sort()
         while done < dt:
             left = dt - done
-            count = max(1, math.ceil(left / self._largest_step() - 1e-9))
+            longest = self._largest_step() if self._newton is None else self._longest_implicit(dt)
+            count = max(1, math.ceil(left / longest - 1e-9))
             if self._counters.substeps + count > settings.max_substeps:
+                way = "soften the material, make cells larger, or use the implicit integrator"
                 raise SolverError(
-                    f"explicit substeps of {left / count:.3g} s would be needed "
+                    f"{settings.integrator} substeps of {left / count:.3g} s would be needed "
                     f"{self._counters.substeps + count:,} times in a step of {dt:.3g} s (at most "
-                    f"{settings.max_substeps:,}): soften the material, make cells larger, or use the "
-                    "implicit integrator"
+                    f"{settings.max_substeps:,}): {way if self._newton is None else 'make cells larger'}"
                 )
             h = left / count
-            self._substep(h)
-            done = dt if count == 1 else done + h
+            taken = self._substep(h)
+            done = dt if count == 1 and taken == h else done + taken
             self._time = begin + done
             self._counters.substeps += 1
 
@@ -160,25 +173,61 @@ class SolverMPM:
             )
         return min(self.model.mpm.cfl * self.spacing / max(fastest, 1e-30), self._viscous_step)
 
-    def _substep(self, h: float) -> None:
-        grid, gravity = self.grid, [h * g for g in self.model.gravity]
+    def _longest_implicit(self, dt: float) -> float:
+        """Longest implicit substep, s: in it nothing moves or falls by more than `cfl` cells."""
+        velocities = self.grid.particles[rows.VELOCITY : rows.VELOCITY + 3].numpy()
+        speed = math.sqrt(float((velocities**2).sum(axis=0).max()))
+        if not math.isfinite(speed):
+            raise SolverError(f"particles are lost at t = {self._time:.6g} s: their speed is no number")
+        way, settings = self.model.mpm.cfl * self.spacing, self.model.mpm
+        root = math.sqrt(speed**2 + 4.0 * way * math.hypot(*self.model.gravity))
+        return min(2.0 * way / max(speed + root, 1e-30), dt / settings.substeps)
+
+    def _substep(self, h: float) -> float:
+        """Advance by a substep of `h` seconds, or less where an implicit one fails; its length."""
+        grid = self.grid
         if grid.has_strayed():
             grid.sort()
             self._counters.sorts += 1
-        for boundary in self.boundaries:
-            boundary.begin(self._time, h)
         if self._flip > 0.0:
             grid.scatter(0.0, self._affine, (0.0, 0.0, 0.0))
             grid.keep()
-        grid.scatter(h, self._affine, gravity)
-        for boundary in self.boundaries:
-            boundary.apply(grid, h)
+        if self._newton is None:
+            for boundary in self.boundaries:
+                boundary.begin(self._time, h)
+            grid.scatter(h, self._affine, [h * g for g in self.model.gravity])
+            for boundary in self.boundaries:
+                boundary.apply(grid, h)
+        else:
+            h = self._solve(self._newton, h)
         if self._flip > 0.0:
             grid.give_change()
         grid.gather(h, self._flip)
         for boundary in self.boundaries:
             boundary.drive(grid, h)
         self._update_stress(h)
+        return h
+
+    def _solve(self, newton: GridNewton, h: float) -> float:
+        """Put the velocities at the end of an implicit substep into the grid; the substep's length."""
+        counters = self._counters
+        for halving in range(HALVINGS + 1):
+            for boundary in self.boundaries:
+                boundary.begin(self._time, h)
+            outcome = newton.solve(h, [h * g for g in self.model.gravity], self._affine)
+            counters.newton_iterations += outcome.newton_iterations
+            counters.cg_iterations += outcome.cg_iterations
+            if outcome.converged or halving == HALVINGS:
+                break
+            h *= 0.5
+        if not outcome.finite:
+            raise SolverError(
+                f"no implicit substep of {h:.3g} s is possible at t = {self._time:.6g} s: raise the "
+                "substeps, or check velocities and material constants"
+            )
+        counters.converged &= outcome.converged
+        counters.residual = max(counters.residual, outcome.residual)
+        return h
 
     def _update_stress(self, h: float) -> None:
         """The materials' answer to the particles' deformation: stress, what has flowed, speed of sound."""
@@ -253,10 +302,10 @@ class SolverMPM:
             max_penetration=0.0,
             min_volume_ratio=float(volume.min()),
             substeps=self._counters.substeps,
-            newton_iterations=0,
-            cg_iterations=0,
-            converged=True,
-            residual=0.0,
+            newton_iterations=self._counters.newton_iterations,
+            cg_iterations=self._counters.cg_iterations,
+            converged=self._counters.converged,
+            residual=self._counters.residual,
         )
 
     def _elastic_energy(self) -> float:
@@ -296,6 +345,8 @@ def _fields(particles: Particles, matter: Matter, count: int) -> np.ndarray:
     fields = np.zeros((count, len(particles)), np.float32)
     fields[rows.POSITION : rows.POSITION + 3] = particles.positions.T
     fields[rows.VELOCITY : rows.VELOCITY + 3] = particles.velocities.T
+    if particles.gradients is not None:
+        fields[rows.AFFINE : rows.AFFINE + 9] = particles.gradients.reshape(-1, 9).T
     for first in (rows.DEFORMATION, rows.TOTAL):
         if first < count:
             fields[[first, first + 4, first + 8]] = 1.0
