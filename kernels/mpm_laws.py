@@ -56,6 +56,7 @@ import warp as wp
 from gdpro_sim.kernels import particles as rows
 from gdpro_sim.kernels.decomposition import singular_value_decomposition
 from gdpro_sim.kernels.elasticity import COROTATED, NEO_HOOKEAN, STABLE_NEO_HOOKEAN, STVK_HENCKY
+from gdpro_sim.kernels.lane_math import LANE_MATH
 from gdpro_sim.kernels.lanes import CPU_FLAGS, PRELUDE
 from gdpro_sim.kernels.particles import DEFORMATION, DEFORMATION_LOW, read_compensated, write_compensated
 
@@ -167,79 +168,6 @@ _GROUP = f"""
 #endif
 """
 """Opens a snippet: rows of a group's particles, and double vectors D."""
-
-_MATH = """
-    // 1 / sqrt(v) to an ulp or two, v > 0.
-    auto rsqrt_ = [&](F v) {
-#if defined(__CUDACC__)
-        return rsqrtf(v);
-#elif defined(__AVX512F__)
-        const F y = (F)__builtin_ia32_rsqrt14ps512_mask(v, v, (unsigned short)0xffff);
-        const F r = 1.0f - v * y * y;
-        return y + y * r * (0.5f + 0.375f * r);
-#else
-        return 1.0f / sqrt_(v);
-#endif
-    };
-    // log u, where x = u - 1 is known better than u.
-    auto log_of = [&](F u, F x) {
-        const I shifted = bits_of(u) - 0x3f3504f3;
-        const I n = shifted >> 23;
-        const F m = of_bits((shifted & 0x007fffff) + 0x3f3504f3);
-        const F f = select(n == 0, x, m - 1.0f);
-        const F t = f / (f + 2.0f), q = t * t;
-        const F series = (((q * 0.22222222f + 0.28571429f) * q + 0.4f) * q + 0.66666667f) * q + 2.0f;
-        return to_float(n) * 0.69314718f + t * series;
-    };
-    auto log1p_ = [&](F x) { return log_of(x + 1.0f, x); };
-    auto log_ = [&](F u) { return log_of(u, u - 1.0f); };
-    auto expm1_ = [&](F v) {
-        const F x = max_(min_(v, splat(80.0f)), splat(-80.0f));
-        const F n = floor_(x * 1.4426950f + 0.5f);
-        const F r = (x - n * 0.69314575f) - n * 1.4286068e-6f;
-        F p = r * (1.0f / 7.0f) + 1.0f;
-        p = p * r * (1.0f / 6.0f) + 1.0f;
-        p = p * r * (1.0f / 5.0f) + 1.0f;
-        p = p * r * (1.0f / 4.0f) + 1.0f;
-        p = p * r * (1.0f / 3.0f) + 1.0f;
-        p = p * r * 0.5f + 1.0f;
-        const F power = of_bits((to_int(n) + 127) << 23);
-        return power * (p * r) + (power - 1.0f);
-    };
-    auto exp_ = [&](F x) { return expm1_(x) + 1.0f; };
-    // Angle of the point (x, y), y >= 0.
-    auto angle_ = [&](F y, F x) {
-        const F a = abs_(x), high = max_(a, y), low = min_(a, y);
-        const F t = low / select(high > 0.0f, high, splat(1.0f)), q = t * t;
-        F p = q * 0.0028340643f - 0.016005031f;
-        p = p * q + 0.042587608f;
-        p = p * q - 0.074954454f;
-        p = p * q + 0.10636754f;
-        p = p * q - 0.14202571f;
-        p = p * q + 0.19992484f;
-        p = p * q - 0.33333067f;
-        const F first = t + t * q * p;
-        const F steep = select(y > a, 1.5707963f - first, first);
-        return select(x < 0.0f, 3.1415927f - steep, steep);
-    };
-    // Of angles from 0 to 60 degrees.
-    auto cos_ = [&](F x) {
-        const F q = x * x;
-        F p = q * -2.7557319e-7f + 2.4801587e-5f;
-        p = p * q - 1.3888889e-3f;
-        p = p * q + 4.1666667e-2f;
-        p = p * q - 0.5f;
-        return p * q + 1.0f;
-    };
-    auto sin_ = [&](F x) {
-        const F q = x * x;
-        F p = q * -2.5052108e-8f + 2.7557319e-6f;
-        p = p * q - 1.9841270e-4f;
-        p = p * q + 8.3333333e-3f;
-        p = p * q - 0.16666667f;
-        return x + x * (p * q);
-    };
-"""
 
 _DEGENERATE = f"""
 {_GROUP}
@@ -386,8 +314,8 @@ _BEGIN = """
     }
 """
 
-_PRINCIPAL = f"""
-    if (any(principal)) {{
+_PRINCIPAL = """
+    if (any(principal)) {
         // Eigenvalues x of b - 1 by Cardano's formula; the discriminant and the scale are float64.
         const D third = (w00 + w11 + w22) * (1.0 / 3.0);
         const D v00 = w00 - third, v11 = w11 - third, v22 = w22 - third;
@@ -404,21 +332,21 @@ _PRINCIPAL = f"""
         const F angle = angle_(sqrt_(max_(sine2, zero)), narrow(cosine)) * (1.0f / 3.0f);
         const F radius = radius2 * inverse, mean = narrow(third);
         const F along = radius * cos_(angle), across = 1.7320508f * radius * sin_(angle);
-        const F y[3] = {{along + along, across - along, -across - along}};
+        const F y[3] = {along + along, across - along, -across - along};
         F x[3];
         for (int i = 0; i < 3; ++i) x[i] = max_(mean + y[i], splat(-1.0f + 1.0e-6f));
-        F s[3], rise[3], t[3], back[3] = {{zero, zero, zero}};  // rise: s - 1, back: s_new / s - 1
-        for (int i = 0; i < 3; ++i) {{
+        F s[3], rise[3], t[3], back[3] = {zero, zero, zero};  // rise: s - 1, back: s_new / s - 1
+        for (int i = 0; i < 3; ++i) {
             s[i] = sqrt_(x[i] + 1.0f);
             rise[i] = x[i] / (s[i] + 1.0f);
             t[i] = select(corotated, 2.0f * mu * s[i] * rise[i], mu * x[i]) + pressure;
-        }}
+        }
         const F widest = x[0];
         const F shear = select(corotated, mu + mu, mu) * (1.0f + widest);
         stiff = select((neo | stable | corotated), stiff + shear, stiff);
         I flows = zero > 1.0f;
 
-        if (any(hencky)) {{
+        if (any(hencky)) {
             F e[3];
             for (int i = 0; i < 3; ++i) e[i] = 0.5f * log_of(x[i] + 1.0f, x[i]);
             const F trace = e[0] + e[1] + e[2], mean = trace * (1.0f / 3.0f);
@@ -426,64 +354,67 @@ _PRINCIPAL = f"""
             for (int i = 0; i < 3; ++i) dev[i] = e[i] - mean;
             const F size = sqrt_(dev[0] * dev[0] + dev[1] * dev[1] + dev[2] * dev[2]);
             const F divisor = max_(size, splat(1.0e-30f)), known = narrow(memory);
-            F lost = zero, open = zero;  // 1 - (size after / before), and growth of the trace
-            if (any(law == (float)STVK_HENCKY)) {{
+            F lost = zero, total = trace;  // 1 - (size after / before), and the trace after
+            if (any(law == (float)STVK_HENCKY)) {
                 const F hardening = constant(HARDENING), q = 2.4494897f * mu * size;
                 const F over = max_(q - (constant(YIELD) + hardening * known), zero);
                 const F growth = over / (3.0f * mu + hardening);
                 const I metal = (law == (float)STVK_HENCKY) & (growth > 0.0f);
                 lost = select(metal, 1.2247449f * growth / divisor, lost);
                 change = select(metal, growth, change);
-            }}
-            if (any(pasty)) {{
+            }
+            if (any(pasty)) {
                 const F shear = 1.4142136f * mu * size, limit = constant(YIELD) * 0.57735027f;
                 const F over = shear - limit;
                 const I yields = pasty & (over > 0.0f);
-                if (any(yields)) {{
+                if (any(yields)) {
                     // log(k rate^n + mu h rate) = log over, in y = log rate: convex, from above.
                     const F index = constant(B), log_over = log_(max_(over, splat(1.0e-30f)));
                     const F thick = constant(A) - log_over;
                     const F quick = log_(max_(mu * h, splat(1.0e-30f))) - log_over;
                     F y = min_(-thick / index, -quick);
                     F viscous = one, elastic = zero;
-                    for (int i = 0; i < 5; ++i) {{
+                    for (int i = 0; i < 6; ++i) {
                         viscous = exp_(thick + index * y);
                         elastic = exp_(quick + y);
-                        const F sum = viscous + elastic;
-                        y -= log_(sum) * sum / (index * viscous + elastic);
-                    }}
+                        const F sum = viscous + elastic, off = log_(sum);
+                        const I far = yields & (off > 2.0e-6f);
+                        if (!any(far)) break;
+                        y -= select(far, off * sum / (index * viscous + elastic), zero);
+                    }
                     const F relaxed = over * elastic / (viscous + elastic);
                     lost = select(yields, relaxed / max_(shear, splat(1.0e-30f)), lost);
                     change = select(yields, 0.81649658f * size * lost, change);
-                }}
-            }}
-            if (any(sand)) {{
+                }
+            }
+            if (any(sand)) {
                 const F room = max_(min_(1.0f - known / constant(C), one), zero);
                 const F tip = constant(B) * room, opened = trace + known;
                 const F over = size + (1.5f * lam / mu + 1.0f) * (opened - tip) * constant(A);
                 const I parted = opened >= tip;
                 lost = select(sand, select(parted, one, max_(over, zero) / divisor), lost);
-                open = select(sand, select(parted, tip - trace, known), open);
-                change = select(sand, -open, change);
-            }}
-            for (int i = 0; i < 3; ++i) {{
-                const F less = open * (1.0f / 3.0f) - lost * dev[i];
-                t[i] = select(hencky, 2.0f * mu * (e[i] + less) + lam * (trace + open), t[i]);
-                back[i] = select(hencky, expm1_(less), back[i]);
-            }}
-            flows = flows | (hencky & ((lost != 0.0f) | (open != 0.0f)));
+                total = select(sand, select(parted, tip, opened), total);
+                change = select(sand, select(parted, trace - tip, -known), change);
+            }
+            for (int i = 0; i < 3; ++i) {
+                const F after = (1.0f - lost) * dev[i] + total * (1.0f / 3.0f);
+                const F more = (total - trace) * (1.0f / 3.0f) - lost * dev[i];
+                t[i] = select(hencky, 2.0f * mu * after + lam * total, t[i]);
+                back[i] = select(hencky, expm1_(more), back[i]);
+            }
+            flows = flows | (hencky & ((lost != 0.0f) | (total != trace)));
             const F least = min_(min_(t[0], t[1]), min_(t[2], zero));
             stiff = select(hencky, lam + 2.0f * mu - least + mu * max_(widest, zero), stiff);
-        }}
-        if (any(snow)) {{
+        }
+        if (any(snow)) {
             const F low = -constant(A), high = constant(B);
             F kept[3], r[3];
-            for (int i = 0; i < 3; ++i) {{
+            for (int i = 0; i < 3; ++i) {
                 kept[i] = max_(min_(rise[i], high), low);
                 r[i] = (rise[i] - kept[i]) / (kept[i] + 1.0f);
                 back[i] = select(snow, (kept[i] - rise[i]) / s[i], back[i]);
                 flows = flows | (snow & (kept[i] != rise[i]));
-            }}
+            }
             const F known = narrow(memory);
             const F after = known + (1.0f + known) * PRODUCT(r);
             const F bounded = max_(min_(after, splat(19.0f)), splat(-0.4f));
@@ -493,8 +424,8 @@ _PRINCIPAL = f"""
                 t[i] = select(snow, hard * (2.0f * mu * (kept[i] + 1.0f) * kept[i] + p), t[i]);
             const F square = (high + 1.0f) * (high + 1.0f);
             stiff = select(snow, hard * (2.0f * mu * square + lam * (e + 1.0f) * (e + 1.0f)), stiff);
-        }}
-        if (any(tears)) {{
+        }
+        if (any(tears)) {
             const F most = max_(max_(t[0], t[1]), t[2]);
             const I strong = tears & (most > 0.0f);
             const F ratio = select(strong, most / (strength * max_(J, splat(1.0e-6f))), zero);
@@ -503,15 +434,15 @@ _PRINCIPAL = f"""
             const F brittle = 1.0f / max_(constant(BAND) / band - 0.5f, splat(0.1f));
             const F torn = (past - expm1_(-brittle * past)) / (past + 1.0f);
             damage = select(tears & (past > 0.0f), torn, zero);
-            for (int i = 0; i < 3; ++i) {{
+            for (int i = 0; i < 3; ++i) {
                 t[i] = select(tears & (t[i] > 0.0f), t[i] * (1.0f - damage), t[i]);
                 const I wide_open = tears & (damage > 0.99f) & (s[i] > 2.0f);
                 back[i] = select(wide_open, 2.0f / s[i] - 1.0f, back[i]);
                 flows = flows | wide_open;
-            }}
+            }
             put(INTERNAL + 1, select(tears, max_(past, zero), row(INTERNAL + 1)));
             put(INTERNAL + 2, select(tears, damage, row(INTERNAL + 2)));
-        }}
+        }
 
         // A function of the principal values is a polynomial of v = b - 1 - mean: Newton's, by differences.
         const F g00 = narrow(v00), g11 = narrow(v11), g22 = narrow(v22), g01 = b01, g02 = b02, g12 = b12;
@@ -521,7 +452,7 @@ _PRINCIPAL = f"""
         const F span = y[0] - y[2], gap = (y[1] - y[2]) * (y[1] - y[0]);
         const F per_span = select(span > 0.0f, 1.0f / span, zero);
         const F per_gap = select(gap < -1.0e-7f * span * span, 1.0f / gap, zero);
-        auto spread = [&](const F* value, F* out) {{
+        auto spread = [&](const F* value, F* out) {
             const F slope = (value[0] - value[2]) * per_span;
             const F bend = ((value[1] - value[2]) - slope * (y[1] - y[2])) * per_gap;
             const F linear = slope - bend * (y[0] + y[2]);
@@ -532,27 +463,28 @@ _PRINCIPAL = f"""
             out[3] = linear * g01 + bend * s01;
             out[4] = linear * g02 + bend * s02;
             out[5] = linear * g12 + bend * s12;
-        }};
+        };
         F whole[6];
         spread(t, whole);
         for (int i = 0; i < 6; ++i) tau[i] = select(principal, whole[i], tau[i]);
-        if (any(flows)) {{
+        if (any(flows)) {
             // F grows by (Q diag(back) Q^T) F.
             F more[6];
             spread(back, more);
-            const F M[9] = {{more[0], more[3], more[4], more[3], more[1], more[5], more[4], more[5], more[2]}};
-            for (int j = 0; j < 3; ++j) {{
-                const F column[3] = {{narrow(f[j]), narrow(f[3 + j]), narrow(f[6 + j])}};
-                for (int i = 0; i < 3; ++i) {{
+            const F M[9] = {
+                more[0], more[3], more[4], more[3], more[1], more[5], more[4], more[5], more[2]};
+            for (int j = 0; j < 3; ++j) {
+                const F column[3] = {narrow(f[j]), narrow(f[3 + j]), narrow(f[6 + j])};
+                for (int i = 0; i < 3; ++i) {
                     const F step = M[3 * i] * column[0] + M[3 * i + 1] * column[1] + M[3 * i + 2] * column[2];
                     const D sum = f[3 * i + j] + wide(select(flows, step, zero));
                     const F high = narrow(sum);
                     put(DEFORMATION + 3 * i + j, high);
                     put(DEFORMATION_LOW + 3 * i + j, narrow(sum - wide(high)));
-                }}
-            }}
-        }}
-    }}
+                }
+            }
+        }
+    }
 """
 
 _FLUID = """
@@ -607,14 +539,15 @@ _END = """
         for (int i = 0; i < 3; ++i) put(VELOCITY + i, v[i] = v[i] * slower);
         for (int i = 0; i < 9; ++i) put(AFFINE + i, c[i] * slower);
     }
-    put(SPEED, sqrt_(stiff * constant(LIGHTNESS)) + sqrt_(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]));
+    const F speed = sqrt_(stiff * constant(LIGHTNESS)) + sqrt_(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
+    put(SPEED, speed + (d - d));  // no number where F is none
 """
 
 _UPDATE = f"""
 {_GROUP}
 #define PRODUCT(v) (v[0] + v[1] + v[2] + v[0] * v[1] + v[0] * v[2] + v[1] * v[2] + v[0] * v[1] * v[2])
 #define LOOSE {LOOSE}f
-{_MATH}
+{LANE_MATH}
 {_BEGIN}
 {_PRINCIPAL}
 {_FLUID}
