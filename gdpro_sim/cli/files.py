@@ -1,4 +1,4 @@
-"""Commands over meshes, assets and simulations: import, simulate, render, export, info, scenes."""
+"""Commands over meshes, assets and simulations: import, convert, simulate, render, export, info, scenes."""
 
 from __future__ import annotations
 
@@ -31,14 +31,19 @@ from gdpro_sim.errors import RequestError
 
 @app.command("import")
 def import_command(
-    mesh: Annotated[Path, typer.Argument(help="Mesh file: OBJ, PLY, STL, glTF/GLB, OFF, DAE, USD …")],
+    mesh: Annotated[
+        Path,
+        typer.Argument(help="Mesh: OBJ, PLY, STL, glTF/GLB, OFF, DAE, USD …; or a splat cloud: PLY, SPLAT."),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Asset to write: .usdc, .usda or .usdz.")],
     budget: Annotated[
         int, typer.Option("--budget", min=100, max=5_000_000, help="Gaussians to aim for.")
     ] = 50_000,
     color: Color = None,
     texture: Annotated[Path | None, typer.Option("--texture", help="Texture image of the mesh.")] = None,
-    up: Annotated[str, typer.Option("--up", help="Up axis of the file: auto, y or z.")] = "auto",
+    up: Annotated[
+        str, typer.Option("--up", help="Up axis of the file: auto, y or z; of a cloud also x, -x, -y, -z.")
+    ] = "auto",
     scale: Annotated[
         float | None, typer.Option("--scale", help="Multiply lengths, e.g. 0.001 for mm.")
     ] = None,
@@ -53,14 +58,23 @@ def import_command(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Turn a mesh into a Gaussian asset: bound Gaussians, tetrahedra, one USD file."""
+    """Turn a mesh into a Gaussian asset: bound Gaussians, tetrahedra, one USD file.
+
+    A splat cloud becomes one as it is, without mesh and tetrahedra: MPM can simulate it. For an asset with a
+    mesh made of it, see `gdpro generate --from-splat`.
+    """
     setup(quiet, debug)
     check_exists(mesh)
-    check_choice("--up", up, ("auto", "y", "z"))
     check_suffix(output, (".usdc", ".usda", ".usdz"))
     from gdpro_sim.asset import import_mesh
     from gdpro_sim.files import check_writable
+    from gdpro_sim.io.cloud import import_cloud, is_cloud
     from gdpro_sim.materials import Material
+
+    cloud = is_cloud(mesh)
+    check_choice("--up", up, ("auto", "y", "z", "x", "-x", "-y", "-z") if cloud else ("auto", "y", "z"))
+    if cloud and (color is not None or texture is not None):
+        raise RequestError(f"--color and --texture are for meshes, but {mesh} is a splat cloud")
 
     check_writable(output)
     chosen = None
@@ -71,22 +85,54 @@ def import_command(
             raise RequestError(f"--material: {first_line(error)}") from None
     begin = time.perf_counter()
     with progress(quiet) as report:
-        asset = import_mesh(
-            mesh,
-            budget=budget,
-            color=color,
-            texture=texture,
-            up=up,
-            scale=scale,
-            material=chosen,
-            tets=tets > 0,
-            target_tets=tets or 6_000,
-            seed=seed or 0,
-            on_progress=lambda phase: report(phase, 0, 0),
+        asset = (
+            import_cloud(mesh, up=up, scale=scale, material=chosen)
+            if cloud
+            else import_mesh(
+                mesh,
+                budget=budget,
+                color=color,
+                texture=texture,
+                up=up,
+                scale=scale,
+                material=chosen,
+                tets=tets > 0,
+                target_tets=tets or 6_000,
+                seed=seed or 0,
+                on_progress=lambda phase: report(phase, 0, 0),
+            )
         )
         asset.save(output)
     summary = {"asset": str(output), **asset.summary(), "seconds": round(time.perf_counter() - begin, 2)}
     show(summary, f"Asset {output}", json_output, quiet)
+
+
+@app.command()
+def convert(
+    config: Annotated[Path, typer.Argument(help="PhysGaussian configuration: .json.")],
+    asset: Annotated[
+        Path, typer.Option("--asset", help="What it simulates: a splat cloud, an asset or a mesh.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Scene to write: .yaml.")],
+    particles: Annotated[
+        int | None, typer.Option("--particles", min=100, help="To aim for, in place of its n_grid.")
+    ] = None,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Turn a PhysGaussian configuration into a scene; what the scene does not follow is said in a line each."""
+    setup(quiet, debug)
+    check_exists(config)
+    check_exists(asset)
+    from gdpro_sim.io.physgaussian import convert as run
+
+    made = run(config, asset, output, particles=particles)
+    summary = {"scene": str(output), "notes": list(made.messages)}
+    if json_output:
+        print(json.dumps(summary))
+    elif not quiet:
+        table(f"Scene {output}", [("scene", str(output)), *(("note", line) for line in made.messages)])
 
 
 @app.command()

@@ -118,7 +118,9 @@ class Store:
         if data is None:
             raise OutputError(f"{self._frame(index)} has changed meanwhile; run again")
         figures = json.loads(str(data["figures"]))
-        diagnostics: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in figures["diagnostics"].items()}
+        diagnostics: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in figures["diagnostics"].items()
+        }
         surfaces = [data[f"surface.{k}"] for k in range(sum(n.startswith("surface.") for n in data))]
         return StoredFrame(surfaces, Diagnostics(**diagnostics), figures["solve"])
 

@@ -53,7 +53,7 @@ def compile_particles(
     materials: dict[Material, int] = {}
     bodies: list[Body] = []
     columns: dict[str, list[np.ndarray]] = {
-        key: [] for key in ("positions", "velocities", "volumes", "matter")
+        key: [] for key in ("positions", "velocities", "volumes", "matter", "gradients")
     }
     begin = 0
     for body, placement, material, spacing in zip(scene.bodies, placements, made, spacings, strict=True):
@@ -73,6 +73,8 @@ def compile_particles(
         centre = (mass[:, None] * points).sum(axis=0) / mass.sum()
         columns["positions"].append(points.astype(np.float32))
         columns["velocities"].append(placement.velocities(body, points, centre))
+        spin = np.cross(np.asarray(body.angular_velocity), np.eye(3)).T.astype(np.float32)
+        columns["gradients"].append(np.broadcast_to(spin, (count, 3, 3)))
         columns["volumes"].append(filling.volumes)
         columns["matter"].append(matter)
         loose = any(item.mpm_only() is not None for item in (material, *parts))
