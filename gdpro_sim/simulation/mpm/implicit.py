@@ -1,0 +1,397 @@
+"""Backward Euler on the MPM grid: projected Newton with conjugate gradients that assemble no matrix."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from gdpro_sim.errors import SolverError
+from gdpro_sim.kernels import linalg, mpm_implicit, mpm_newton, mpm_stiffness
+from gdpro_sim.materials import Material
+from gdpro_sim.simulation.model import MpmSettings, Particles
+from gdpro_sim.simulation.mpm.boundaries import Boundary
+from gdpro_sim.simulation.mpm.grid import Grid
+from gdpro_sim.simulation.mpm.matter import Matter, flows
+
+RANGES = 128
+"""Partial sums of energies and measures: fixed, so that totals do not depend on the number of threads."""
+
+CUDA_CHECK_EVERY = 16
+"""On CUDA the host looks at the residual only so often; steps past convergence change nothing."""
+
+ARMIJO = 1e-4
+MAX_HALVINGS = 20
+
+ROUNDING = 2.0**-23
+"""Of float32, relative."""
+
+
+class Outcome(NamedTuple):
+    """residual: m/s, of the last Newton step, as if nodes had a full cell's mass"""
+
+    converged: bool
+    finite: bool
+    residual: float
+    newton_iterations: int
+    cg_iterations: int
+
+
+class GridNewton:
+    """Finds the grid's velocities at the end of a substep; see `gdpro_sim.kernels.mpm_implicit`.
+
+    Memory grows with the grid and is kept. Raises SolverError for materials that flow or tear, and for
+    boundaries with a state of their own.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        particles: Particles,
+        matter: Matter,
+        boundaries: tuple[Boundary, ...],
+        settings: MpmSettings,
+    ) -> None:
+        check(matter.materials, boundaries)
+        self.grid, self.boundaries, self.settings = grid, boundaries, settings
+        self.table = matter.table
+        self._iterations = 0
+        volumes = particles.volumes.astype(np.float64)
+        moduli = np.array([lam + 2.0 * mu for lam, mu in (m.lame for m in matter.materials)])
+        densities = np.array([material.density for material in matter.materials])
+        self._stiffness = float(volumes @ moduli[particles.matter])
+        self._mass = float(volumes @ densities[particles.matter])
+        self._full = float(densities[particles.matter].max()) * grid.spacing**3
+        device, stride = grid.device, grid.particles.shape[1]
+        self.per = 64 if device == "cpu" else 1
+        self.work = wp.zeros((int(mpm_implicit.WORK), stride), dtype=float, device=device)
+        self._energies = wp.zeros(len(particles), dtype=wp.float64, device=device)
+        self._sums, self._more_sums = (wp.zeros(RANGES, dtype=wp.float64, device=device) for _ in range(2))
+        self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
+        self._tolerance = wp.full(1, settings.cg_tolerance, dtype=wp.float64, device=device)
+        self._projectors = wp.zeros(0, dtype=wp.mat33, device=device)
+        self._values: wp.array | None = None
+
+    def _reserve(self) -> None:
+        """Arrays over the nodes, after the grid has changed."""
+        grid = self.grid
+        if self._values is grid.values:
+            return
+        self._values = grid.values
+        nodes = 64 * grid.count
+
+        def vector(name: str) -> wp.array:
+            return grid.array(f"implicit.{name}", nodes, wp.vec4)
+
+        self._momentum, self._target, self._start = map(vector, ("momentum", "target", "start"))
+        self._force, self._right, self._step = map(vector, ("force", "right", "step"))
+        self._diagonal, self._off_diagonal = map(vector, ("diagonal", "off_diagonal"))
+        self._residual, self._z, self._p, self._q = map(vector, ("residual", "z", "p", "q"))
+        if self.boundaries:
+            self._projectors = grid.array("implicit.projectors", nodes, wp.mat33)
+            self._unbounded, self._bounded, self._held = map(vector, ("unbounded", "bounded", "held"))
+        self._inverse = grid.array("implicit.inverse", nodes, wp.mat33)
+        self._indices = nodes // self.per
+        self._dots = grid.array("implicit.dots", self._indices, wp.float64)
+        if grid.device == "cpu":
+            self._more_tiles = grid.array("implicit.more_tiles", len(grid.tiles), wp.vec4)
+        self._transfer = [grid.width, grid.spacing]
+
+    def solve(self, h: float, change: Sequence[float], affine: float) -> Outcome:
+        """Leave the velocities after `h` seconds in the grid's values.
+
+        change: m/s, what gravity adds; affine: as in `Grid.scatter`
+        """
+        grid, settings = self.grid, self.settings
+        grid.scatter(0.0, affine, change)
+        self._reserve()
+        wp.copy(self._momentum, grid.values)
+        wp.copy(self._target, grid.values)
+        speed = self._measure(self._momentum)[1]
+        energy = self._choose_start(h, change)
+        self._iterations, residual, done = 0, math.inf, 0
+        while done < settings.newton_iterations:
+            self.linearise(h)
+            jump = 0.0
+            if self.boundaries:
+                jump = self._meet_boundaries(h, speed + h * math.hypot(*change))
+                energy = self.energy(h)
+                if jump > 0.0:
+                    self.linearise(h)
+            if not math.isfinite(energy):
+                break
+            self.set_right_hand_side()
+            solved = self.solve_linear()
+            slope, move = self._measure(self._step)
+            done += 1
+            residual = max(jump, move)
+            if not math.isfinite(slope + move):
+                energy = math.inf
+                break
+            length, energy = self._line_search(h, energy, slope, self._noise(h, energy, speed))
+            if length == 0.0:
+                break
+            if solved and length == 1.0 and residual <= settings.newton_tolerance:
+                return Outcome(True, True, residual, done, self._iterations)
+        return Outcome(False, math.isfinite(energy), residual, done, self._iterations)
+
+    def _noise(self, h: float, energy: float, speed: float) -> float:
+        """J that rounding of the velocities may make of an energy."""
+        strain = 4.0 * h / self.grid.spacing * ROUNDING * speed
+        elastic = strain * math.sqrt(self._stiffness)
+        inertial = ROUNDING * speed * math.sqrt(self._mass)
+        return elastic**2 + 2.0 * math.sqrt(abs(energy)) * (elastic + inertial)
+
+    def _choose_start(self, h: float, change: Sequence[float]) -> float:
+        """Put the guess of lowest energy into the grid: falling, coasting, or all as one; its energy."""
+        guesses = [(wp.vec3(), 1.0), (wp.vec3(*(-x for x in change)), 1.0)]
+        if not any(change):
+            guesses.pop()
+        energies = [self._guess(h, *guess) for guess in guesses]
+        best = int(np.argmin(energies))
+        if not math.isfinite(energies[best]):
+            values = self._momentum.numpy().astype(np.float64)
+            mean = (values[:, 3:] * values[:, :3]).sum(0) / values[:, 3].sum()
+            return self._guess(h, wp.vec3(*mean), 0.0)
+        if best < len(guesses) - 1:
+            return self._guess(h, *guesses[best])
+        return energies[best]
+
+    def _guess(self, h: float, v: wp.vec3, weight: float) -> float:
+        self._over_nodes(mpm_newton.fill, [v, weight, self._momentum], [self.grid.values])
+        energy = self.energy(h)
+        return energy if math.isfinite(energy) else math.inf
+
+    # ---- the function and its derivatives at the grid's values ----
+
+    def energy(self, h: float) -> float:
+        """E in J; infinite where a particle is turned inside out. Leaves velocity gradients in `work`."""
+        grid = self.grid
+        if grid.device == "cpu":
+            self._over_blocks(
+                mpm_stiffness.gradient_blocks,
+                [grid.starts, grid.coords, grid.neighbors, grid.values, grid.particles],
+                [self.work],
+            )
+        else:
+            self._over_particles(mpm_stiffness.gradient_particles, [grid.values, grid.particles], [self.work])
+        grid.launch(
+            mpm_implicit.trial_energy,
+            len(grid.ids),
+            [float(h), grid.matter, self.table, grid.particles, self.work],
+            [self._energies],
+        )
+        self._reduce(mpm_newton.inertia_energy, [grid.values, self._target], [self._dots])
+        return self._total(self._energies) + self._total(self._dots)
+
+    def linearise(self, h: float, *, exact: bool = False) -> None:
+        """Forces and stiffness at the velocity gradients that `energy` has left; projected unless `exact`."""
+        grid = self.grid
+        grid.launch(
+            mpm_implicit.linearise,
+            len(grid.ids),
+            [float(h), int(exact), grid.matter, self.table, grid.particles],
+            [self.work],
+            minimum=256,
+        )
+        if grid.device == "cpu":
+            common = [grid.starts, grid.coords, grid.particles, self.work]
+            self._over_blocks(mpm_stiffness.moment_blocks, common, [grid.tiles])
+            self._add_tiles(grid.tiles, self._force)
+            self._over_blocks(mpm_stiffness.diagonal_blocks, common, [grid.tiles, self._more_tiles])
+            self._add_tiles(grid.tiles, self._diagonal)
+            self._add_tiles(self._more_tiles, self._off_diagonal)
+            return
+        for array in (self._force, self._diagonal, self._off_diagonal):
+            array.zero_()
+        common = [grid.particles, self.work]
+        self._over_particles(mpm_stiffness.moment_particles, common, [self._force])
+        self._over_particles(mpm_stiffness.diagonal_particles, common, [self._diagonal, self._off_diagonal])
+
+    def set_right_hand_side(self) -> None:
+        """Minus the gradient, and the preconditioner, from what `linearise` has left."""
+        self._over_nodes(
+            mpm_newton.residual,
+            [self.grid.values, self._target, self._force, self._projectors],
+            [self._right],
+        )
+        self._over_nodes(
+            mpm_newton.invert_blocks,
+            [self._target, self._diagonal, self._off_diagonal, self._projectors],
+            [self._inverse],
+        )
+
+    def multiply(self, p: wp.array, q: wp.array) -> None:
+        """q = Hessian of E times p, in free directions."""
+        grid = self.grid
+        if grid.device == "cpu":
+            self._over_blocks(
+                mpm_stiffness.product_blocks,
+                [grid.starts, grid.coords, grid.neighbors, p, grid.particles, self.work],
+                [grid.tiles],
+            )
+            grid.launch(
+                mpm_newton.cg_product_of_tiles,
+                grid.count,
+                [grid.width, grid.sources, grid.tiles, self._target, self._projectors, p],
+                [q, self._dots],
+                minimum=64,
+            )
+            return
+        q.zero_()
+        self._over_particles(mpm_stiffness.product_particles, [p, grid.particles, self.work], [q])
+        self._over_nodes(mpm_newton.cg_product, [self._target, self._projectors, p], [q, self._dots])
+
+    def solve_linear(self) -> bool:
+        """`_step` = Hessian^-1 `_right`; whether it has converged.
+
+        Preconditioned conjugate gradients, Saad 2003, "Iterative Methods for Sparse Linear Systems",
+        algorithm 9.1.
+        """
+        self._reduce(
+            mpm_newton.cg_reset,
+            [self._right, self._inverse],
+            [self._step, self._residual, self._z, self._p, self._dots],
+        )
+        self._scalar(linalg.cg_begin)
+        check_every = 1 if self.grid.device == "cpu" else CUDA_CHECK_EVERY
+        for iteration in range(self.settings.cg_iterations):
+            if iteration % check_every == 0 and self._scalars.numpy()[linalg.CG_DONE] != 0.0:
+                break
+            self._over_nodes(mpm_newton.cg_direction, [self._z, self._scalars], [self._p])
+            self.multiply(self._p, self._q)
+            self._scalar(linalg.cg_set_alpha)
+            self._reduce(
+                mpm_newton.cg_update,
+                [self._p, self._q, self._inverse, self._scalars],
+                [self._step, self._residual, self._z, self._dots],
+            )
+            self._scalar(linalg.cg_set_beta)
+        scalars = self._scalars.numpy()
+        self._iterations += int(scalars[linalg.CG_ITERATIONS])
+        return bool(scalars[linalg.CG_DONE] > 0.0)
+
+    def _line_search(self, h: float, energy: float, slope: float, noise: float) -> tuple[float, float]:
+        """Halve the step until the energy falls enough: (length, energy there); (0, energy) if it never does.
+
+        Particles turned inside out have infinite energy, so no accepted step inverts one.
+        """
+        values = self.grid.values
+        wp.copy(self._start, values)
+        length = 1.0
+        for _ in range(MAX_HALVINGS):
+            self._over_nodes(mpm_newton.combine, [self._start, length, self._step], [values])
+            trial = self.energy(h)
+            if trial <= energy + ARMIJO * length * slope + noise:
+                return length, trial
+            length *= 0.5
+        wp.copy(values, self._start)
+        return 0.0, energy
+
+    # ---- boundaries ----
+
+    def _meet_boundaries(self, h: float, scale: float) -> float:
+        """Free directions, targets, and held velocities, from forces as they are.
+
+        Returns by how much that moved a node, m/s.
+        """
+        grid, u = self.grid, self._unbounded
+        self._over_nodes(mpm_newton.unbounded, [self._momentum, self._force], [u])
+        values = self._start
+        wp.copy(values, grid.values)
+        wp.copy(grid.values, u)
+        self._apply(h)
+        wp.copy(self._bounded, grid.values)
+        scale = max(scale, 1e-6)
+        for k in range(3):
+            self._over_nodes(mpm_newton.probe, [k, scale, u, self._bounded], [grid.values])
+            self._apply(h)
+            self._over_nodes(
+                mpm_newton.differentiate,
+                [k, scale, u, self._bounded, grid.values],
+                [self._projectors],
+            )
+        self._over_nodes(
+            mpm_newton.constrain,
+            [u, self._bounded, self._momentum],
+            [self._projectors, self._held, self._target],
+        )
+        wp.copy(grid.values, values)
+        grid.launch(
+            mpm_newton.hold,
+            RANGES,
+            [64 * grid.count, RANGES, self._full, self._projectors, self._held, self._target],
+            [grid.values, self._more_sums],
+            minimum=8,
+        )
+        return math.sqrt(float(self._more_sums.numpy().max()))
+
+    def _apply(self, h: float) -> None:
+        for boundary in self.boundaries:
+            boundary.apply(self.grid, h)
+
+    # ---- launches ----
+
+    def _over_blocks(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        grid = self.grid
+        grid.launch(kernel, grid.occupied, [*self._transfer, *inputs], outputs, minimum=4)
+
+    def _over_particles(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        grid = self.grid
+        common = [*self._transfer, grid.owners, grid.coords, grid.neighbors]
+        grid.launch(kernel, len(grid.ids), [*common, *inputs], outputs)
+
+    def _over_nodes(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        self.grid.launch(kernel, 64 * self.grid.count, inputs, outputs, minimum=4096)
+
+    def _reduce(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        """A kernel with partial sums."""
+        minimum = 64 if self.per > 1 else 4096
+        self.grid.launch(kernel, self._indices, [self.per, *inputs], outputs, minimum=minimum)
+
+    def _add_tiles(self, tiles: wp.array, out: wp.array) -> None:
+        grid = self.grid
+        grid.launch(mpm_newton.add_tiles, grid.count, [grid.width, grid.sources, tiles], [out], minimum=64)
+
+    def _scalar(self, kernel: wp.Kernel) -> None:
+        """One of the scalar steps of conjugate gradients, over the partial sums of the phase before it."""
+        launch, dots, count = self.grid.launch, self._dots, self._indices
+        if self.grid.device != "cpu":
+            launch(linalg.sum_ranges, RANGES, [count, RANGES, dots], [self._sums])
+            dots, count = self._sums, RANGES
+        launch(kernel, 1, [count, dots, self._tolerance], [self._scalars])
+
+    def _total(self, terms: wp.array) -> float:
+        self.grid.launch(linalg.sum_ranges, RANGES, [len(terms), RANGES, terms], [self._sums], minimum=64)
+        return float(self._sums.numpy().sum())
+
+    def _measure(self, step: wp.array) -> tuple[float, float]:
+        """Slope of E along a step, J, and the largest velocity in it, m/s."""
+        self.grid.launch(
+            mpm_newton.step_measures,
+            RANGES,
+            [64 * self.grid.count, RANGES, self._full, step, self._right, self._target],
+            [self._sums, self._more_sums],
+            minimum=8,
+        )
+        return float(self._sums.numpy().sum()), math.sqrt(float(self._more_sums.numpy().max()))
+
+
+def check(materials: tuple[Material, ...], boundaries: tuple[Boundary, ...]) -> None:
+    """Raise SolverError for what the implicit integrator cannot simulate."""
+    for material in materials:
+        if flows(material):
+            raise SolverError(
+                f'the implicit integrator is for elastic materials, and one with the law "{material.model}" '
+                'flows, yields or tears here: use integrator "explicit"'
+            )
+    if any(boundary.state() for boundary in boundaries):
+        raise SolverError(
+            'the implicit integrator does not move rigid bodies: use integrator "explicit", or fix them'
+        )
+
+
+__all__ = ["GridNewton", "Outcome", "check"]
