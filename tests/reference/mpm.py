@@ -1,8 +1,8 @@
 """Material point method, readable and in float64: the oracle for transfers and for the explicit solver.
 
-One affine particle-in-cell step (Jiang et al. 2015, "The affine particle-in-cell method") with stress by moving
-least squares (Hu et al. 2018, eq. 16) over a dictionary of nodes: no blocks, no tiles, no vectors. The grid's
-nodes lie at integer multiples of the spacing.
+One affine particle-in-cell step (Jiang et al. 2015, "The affine particle-in-cell method") with stress by
+moving least squares (Hu et al. 2018, eq. 16) over a list of nodes, without blocks, tiles and vectors. The
+grid's nodes lie at integer multiples of the spacing.
 """
 
 from __future__ import annotations

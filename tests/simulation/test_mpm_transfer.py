@@ -12,7 +12,8 @@ import warp as wp
 
 from gdpro_sim import device as devices
 from gdpro_sim.errors import SolverError
-from gdpro_sim.kernels import mpm_grid, mpm_transfer, particles as rows
+from gdpro_sim.kernels import mpm_grid, mpm_transfer
+from gdpro_sim.kernels import particles as rows
 from gdpro_sim.simulation.mpm.grid import Grid
 from tests.reference import mpm as reference
 
@@ -130,7 +131,7 @@ def assert_moved(grid: Grid, expected: reference.Cloud) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_splines_sum_to_one_and_have_their_moments(kernel: str) -> None:
-    """The oracle itself: partition of unity, no first moment, D along each axis (Jiang et al. 2015, table 1)."""
+    """The oracle itself: partition of unity, no first moment, D along each axis (Jiang et al. 2015)."""
     x = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 3))
     reach = reference.stencil(kernel, x, SPACING)
     np.testing.assert_allclose(reach.weights.sum(axis=1), 1.0, rtol=1e-13)
