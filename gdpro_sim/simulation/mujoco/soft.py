@@ -1,0 +1,145 @@
+"""Soft bodies as MuJoCo flexes, with masses of their own: MuJoCo would share a body's mass evenly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from gdpro_sim.errors import SceneError
+from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, set_contact
+from gdpro_sim.simulation.mujoco.rigid import COLOR
+from gdpro_sim.simulation.mujoco_model import SoftBody
+
+LEAST_NODE = 1e-3
+"""A node of a grid has at least this share of the mean node's mass: the body may not reach it."""
+
+HELD = 0.5
+"""A node is held where pinned vertices make up this share of what it carries."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """What moves of a flex: vertices, or nodes of a grid.
+
+    positions: [n, 3] m; masses: [n] kg; held: [n] bool; driver: [n] number of the motion that moves it, or -1
+    names:     of their bodies, empty for what is held by the world
+    """
+
+    positions: np.ndarray
+    masses: np.ndarray
+    held: np.ndarray
+    driver: np.ndarray
+    names: tuple[str, ...]
+
+
+def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
+    """The flex, a body for every free vertex or node, and one for every motion of pins. Raises SceneError."""
+    held = np.zeros(len(body.vertices), bool) if body.pinned is None else body.pinned
+    driver = np.full(len(body.vertices), -1)
+    for k, motion in enumerate(body.motions):
+        driver[motion.vertices] = k
+    positions, masses = body.vertices, body.masses
+    if body.reduction != "full":
+        positions, weights = grid(body)
+        masses, held, driver = _of_nodes(body, weights, held, driver)
+    for k in range(len(body.motions)):
+        mover = spec.worldbody.add_body(name=f"{name}_pin{k}", mocap=True)
+        mover.explicitinertial = True
+    names = [""] * len(positions)
+    least = 1e-12
+    for i in np.flatnonzero(~held).tolist():
+        names[i] = f"{name}_{i}"
+        point = spec.worldbody.add_body(name=names[i], pos=positions[i].tolist())
+        point.explicitinertial, point.mass = True, max(float(masses[i]), least)
+        point.ipos, point.inertia = [0.0, 0.0, 0.0], [1e-6 * max(float(masses[i]), least)] * 3
+        for axis in np.eye(3).tolist():
+            item = point.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+            item.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            item.armature, item.damping, item.frictionloss = 0.0, [0.0] * 3, 0.0
+    owners = [
+        names[i] or (f"{name}_pin{driver[i]}" if driver[i] >= 0 else "world") for i in range(len(positions))
+    ]
+    flex = spec.add_flex(name=name, dim=3)
+    flex.elem = body.tets.ravel().tolist()
+    if body.reduction == "full":
+        flex.vertbody = owners
+        if held.any():
+            flex.vert = np.where(held[:, None], positions, 0.0).ravel().tolist()
+    else:
+        flex.order = 1 if body.reduction == "trilinear" else 2
+        flex.cellcount = list(body.cells)
+        flex.nodebody = owners
+        flex.node = np.where(held[:, None], positions, 0.0).ravel().tolist()
+        flex.vertbody = ["world"] * len(body.vertices)
+        flex.vert = body.vertices.ravel().tolist()
+    flex.young, flex.poisson, flex.damping = body.young, body.poisson, body.damping
+    flex.elastic3d = int(body.stable)
+    flex.radius, flex.rgba = body.radius, list(COLOR)
+    flex.selfcollide = (
+        mujoco.mjtFlexSelf.mjFLEXSELF_AUTO if body.self_contact else mujoco.mjtFlexSelf.mjFLEXSELF_NONE
+    )
+    set_contact(flex, body.friction, FLEX_REFERENCE)
+    return Points(positions, masses, held, driver, tuple(names))
+
+
+def grid(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes [n, 3] m of the grid around a body, Z fastest, and their weights [P, n] at its vertices."""
+    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    order = 1 if body.reduction == "trilinear" else 2
+    counts = [order * c + 1 for c in body.cells]
+    axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    each = []
+    for axis, (a, b, cells, count) in enumerate(zip(low, high, body.cells, counts, strict=True)):
+        at = (body.vertices[:, axis] - a) / (b - a) * cells
+        cell = np.clip(at.astype(int), 0, cells - 1)
+        t = at - cell
+        values = [1.0 - t, t] if order == 1 else [(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)]
+        weights = np.zeros((len(at), count))
+        rows = np.arange(len(at))
+        for k, value in enumerate(values):
+            weights[rows, order * cell + k] += value
+        each.append(weights)
+    return nodes, np.einsum("pi,pj,pk->pijk", *each).reshape(len(body.vertices), -1)
+
+
+def _of_nodes(
+    body: SoftBody, weights: np.ndarray, pinned: np.ndarray, driver: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Masses [n], held [n] and drivers [n] of the nodes that carry vertices by `weights` [P, n]."""
+    total = body.masses.sum()
+    if body.reduction == "trilinear":
+        masses = body.masses @ weights
+    else:  # row sums of quadratic functions may be negative: diagonal scaling (Hinton, Rock & Zienkiewicz 1976)
+        masses = body.masses @ weights**2
+    masses = np.maximum(masses, LEAST_NODE * total / weights.shape[1])
+    masses *= total / masses.sum()
+    carried = (weights**2).sum(axis=0) + 1e-12
+    held = (weights[pinned] ** 2).sum(axis=0) > HELD * carried
+    if pinned.any() and not held.any():
+        raise SceneError(
+            f"body {body.name!r}: its pins are smaller than a cell of the {body.reduction} grid of "
+            f"{list(body.cells)} cells, which can hold none of its nodes; give more `cells`, larger pins, or "
+            "`as: full`"
+        )
+    moved = np.full(weights.shape[1], -1)
+    for k in range(len(body.motions)):
+        share = (weights[driver == k] ** 2).sum(axis=0)
+        moved[held & (share > HELD * carried)] = k
+    return masses, held, moved
+
+
+def velocities(body: SoftBody, positions: np.ndarray) -> np.ndarray:
+    """Initial velocities [n, 3] m/s of points that move with the body."""
+    return np.cross(np.asarray(body.angular_velocity), positions - body.centre) + np.asarray(body.velocity)
+
+
+def flex_vertices(data: Any, begin: int, count: int) -> np.ndarray:
+    """Positions [count, 3] m of a flex's vertices."""
+    return np.asarray(data.flexvert_xpos).reshape(-1, 3)[begin : begin + count]
+
+
+__all__ = ["Points", "add_soft", "flex_vertices", "grid", "velocities"]

@@ -1,0 +1,291 @@
+"""MuJoCo behind the `Solver` protocol: rigid bodies and flexes, obstacles on keyframes, exact states."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gdpro_sim.errors import SolverError
+from gdpro_sim.simulation.conditions import pose_at
+from gdpro_sim.simulation.model import Diagnostics, Model
+from gdpro_sim.simulation.mujoco import soft
+from gdpro_sim.simulation.mujoco.energy import elastic_energy, volume_ratios
+from gdpro_sim.simulation.mujoco.world import World, build, compile_spec
+from gdpro_sim.simulation.mujoco_model import RigidBody, SoftBody
+
+log = logging.getLogger(__name__)
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION | mujoco.mjtState.mjSTATE_PLASTIC
+"""What MuJoCo needs to continue to the same bytes."""
+
+WARNINGS = {
+    mujoco.mjtWarning.mjWARN_BADQPOS: "positions are not finite",
+    mujoco.mjtWarning.mjWARN_BADQVEL: "velocities are not finite",
+    mujoco.mjtWarning.mjWARN_BADQACC: "accelerations are not finite",
+    mujoco.mjtWarning.mjWARN_CONTACTFULL: "there are too many contacts for the memory it has",
+    mujoco.mjtWarning.mjWARN_CNSTRFULL: "there are too many constraints for the memory it has",
+}
+
+UNCONVERGED = mujoco.mjtWarning.mjWARN_INERTIA
+"""Says that the elasticity of a flex was not solved to its tolerance, too."""
+
+# MuJoCo would print its warnings, and write them to a file where the program runs.
+mujoco.set_mju_user_warning(lambda text: log.debug("MuJoCo: %s", " ".join(str(text).split())))
+
+
+@dataclass
+class _Count:
+    """Of the last step."""
+
+    substeps: int = 0
+    iterations: int = 0
+    converged: bool = True
+    residual: float = 0.0
+
+
+class SolverMuJoCo:
+    """Rigid and soft bodies in MuJoCo.
+
+    mjmodel, mjdata: MuJoCo's own; actuators of a base may be driven through `mjdata.ctrl` between steps
+    renamed:         (our name, the name taken) of bodies whose names a base had already
+
+    Raises SceneError for a scene that MuJoCo cannot compile.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        assert model.mujoco is not None
+        self.world: World = build(model)
+        self.bodies = model.mujoco.bodies
+        self.renamed = self.world.renamed
+        for ours, name in self.renamed:
+            log.warning("the name %r is the base's; the body is called %r there", ours, name)
+        self.mjmodel = compile_spec(self.world.spec, str(model.mujoco.base or "the scene"))
+        self.mjdata = mujoco.MjData(self.mjmodel)
+        self._view = mujoco.MjData(self.mjmodel)
+        self._flexes = {
+            i: mujoco.mj_name2id(self.mjmodel, mujoco.mjtObj.mjOBJ_FLEX, name)
+            for i, (name, points) in enumerate(zip(self.world.names, self.world.points, strict=True))
+            if points is not None
+        }
+        self._moved = [
+            (self.mjmodel.joint(name), collider)
+            for name, collider in zip(self.world.obstacles, model.colliders, strict=True)
+            if name
+        ]
+        movers = {self.mjmodel.body(name).id for name in self.world.obstacles if name}
+        self._counted = np.array([i not in movers for i in range(self.mjmodel.nbody)])
+        self._count = _Count()
+        self.reset()
+
+    # ---- Solver ----
+
+    def reset(self) -> None:
+        """Back to the model's initial state."""
+        mujoco.mj_resetData(self.mjmodel, self.mjdata)
+        if self.mjmodel.nkey and self.model.mujoco is not None and self.model.mujoco.base is not None:
+            log.debug("keyframes of the base are left alone")
+        for body, name, points in zip(self.bodies, self.world.names, self.world.points, strict=True):
+            if isinstance(body, RigidBody):
+                self._start_rigid(body, name)
+            elif isinstance(body, SoftBody) and points is not None:
+                velocities = soft.velocities(body, points.positions)
+                for i in np.flatnonzero(~points.held).tolist():
+                    address = self.mjmodel.body_dofadr[self.mjmodel.body(points.names[i]).id]
+                    self.mjdata.qvel[address : address + 3] = velocities[i]
+        self._drive(0.0, 0.0)
+        self._count = _Count()
+        self._look()
+
+    def step(self, dt: float) -> None:
+        """Advance by `dt` seconds, in equal parts no longer than the time step of the settings."""
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise SolverError(f"dt must be > 0 s, got {dt}")
+        assert self.model.mujoco is not None
+        count = max(1, math.ceil(dt / self.model.mujoco.settings.timestep - 1e-9))
+        before = self._state()
+        model, data = self.mjmodel, self.mjdata
+        model.opt.timestep = dt / count
+        result = _Count(substeps=count)
+        for warning in data.warning:
+            warning.number = 0
+        begin = data.time
+        for k in range(count):
+            self._drive(begin + k * dt / count, dt / count)
+            mujoco.mj_step(model, data)
+            rounds = int(np.max(data.solver_niter)) if data.nefc else 0
+            result.iterations += rounds
+            result.converged &= rounds < model.opt.iterations
+        result.converged &= data.warning[int(UNCONVERGED)].number == 0
+        self._drive(begin + dt, 0.0)
+        bad = next((text for kind, text in WARNINGS.items() if data.warning[int(kind)].number), None)
+        if bad is None and not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
+            bad = "positions are not finite"
+        if bad is not None:
+            time = data.time
+            mujoco.mj_setState(model, data, before, STATE)
+            raise SolverError(
+                f"MuJoCo failed near {time:.4g} s: {bad}; lower solver.timestep (now {dt / count:.3g} s), "
+                "or soften or separate what meets"
+            )
+        self._count = result
+        self._look()
+
+    def surface_positions(self, body: int) -> np.ndarray:
+        """Deformed surface vertices of a body, [V, 3] float32 m, world."""
+        item = self.bodies[body]
+        if isinstance(item, RigidBody):
+            turn, shift = self.pose(body)
+            return (item.surface @ turn.T + shift).astype(np.float32)
+        embedding = self.model.bodies[body].embedding
+        assert embedding is not None
+        corners = self.vertices(body)[item.tets[embedding.tet_ids]]
+        return np.einsum("vw,vwc->vc", embedding.weights.astype(np.float64), corners).astype(np.float32)
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Everything needed to continue to the same bytes: MuJoCo's integration state, float64."""
+        return {"mujoco": self._state(), "count": self._counts()}
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from a `state_dict`. Raises SolverError for one of another model."""
+        size = mujoco.mj_stateSize(self.mjmodel, STATE)
+        found = np.asarray(state.get("mujoco", np.zeros(0)), np.float64)
+        if found.shape != (size,):
+            raise SolverError(
+                f"the state holds {found.size} numbers, this model has {size}: it is of another"
+            )
+        mujoco.mj_setState(self.mjmodel, self.mjdata, found, STATE)
+        substeps, iterations, converged, residual = np.asarray(state["count"]).tolist()
+        self._count = _Count(int(substeps), int(iterations), bool(converged), residual)
+        self._look()
+
+    def diagnostics(self) -> Diagnostics:
+        """Energies in J, momenta about the world's origin, contacts; obstacles and pins do not count."""
+        model, data = self.mjmodel, self._view
+        counted = self._counted
+        mass = model.body_mass[counted]
+        positions, linear, angular, inertia = self._motion(counted)
+        spin = np.einsum("bij,bj->bi", inertia, angular)
+        kinetic = 0.5 * (mass * (linear**2).sum(1)).sum() + 0.5 * (angular * spin).sum()
+        momentum = mass @ linear
+        turning = (np.cross(positions, linear) * mass[:, None] + spin).sum(axis=0)
+        gravity = -float(mass @ (positions @ np.asarray(self.model.gravity)))
+        elastic, ratio = 0.0, 1.0
+        for i in self._flexes:
+            body = self.bodies[i]
+            assert isinstance(body, SoftBody)
+            moved = self.vertices(i)
+            elastic += elastic_energy(body, moved)
+            ratio = min(ratio, float(volume_ratios(body, moved).min()))
+        distances = np.asarray(data.contact.dist) if data.ncon else np.zeros(1)
+        return Diagnostics(
+            time=float(self.mjdata.time),
+            kinetic_energy=float(kinetic),
+            elastic_energy=elastic,
+            gravity_energy=gravity,
+            contact_energy=0.0,
+            momentum=_three(momentum),
+            angular_momentum=_three(turning),
+            contacts=int(data.ncon),
+            max_penetration=max(0.0, float(-distances.min())),
+            min_volume_ratio=ratio,
+            substeps=self._count.substeps,
+            newton_iterations=self._count.iterations,
+            cg_iterations=0,
+            converged=self._count.converged,
+            residual=self._count.residual,
+        )
+
+    # ---- more than the protocol ----
+
+    def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation [3, 3] and translation [3] m of a rigid body: x = R X + t of what started at X."""
+        item = self.bodies[body]
+        assert isinstance(item, RigidBody)
+        number = self.mjmodel.body(self.world.names[body]).id
+        turn = self._view.xmat[number].reshape(3, 3).copy()
+        return turn, self._view.xpos[number] - turn @ item.centre
+
+    def vertices(self, body: int) -> np.ndarray:
+        """Positions [P, 3] float64 m of a soft body's vertices."""
+        flex = self._flexes[body]
+        begin, count = self.mjmodel.flex_vertadr[flex], self.mjmodel.flex_vertnum[flex]
+        return soft.flex_vertices(self._view, begin, count)
+
+    # ---- inside ----
+
+    def _state(self) -> np.ndarray:
+        state = np.zeros(mujoco.mj_stateSize(self.mjmodel, STATE))
+        mujoco.mj_getState(self.mjmodel, self.mjdata, state, STATE)
+        return state
+
+    def _counts(self) -> np.ndarray:
+        count = self._count
+        return np.array([count.substeps, count.iterations, count.converged, count.residual], np.float64)
+
+    def _look(self) -> None:
+        """Positions, velocities and contacts of the state as it is, beside it: computing them in place would
+        change what the next step starts from."""
+        mujoco.mj_setState(self.mjmodel, self._view, self._state(), STATE)
+        mujoco.mj_fwdPosition(self.mjmodel, self._view)
+        mujoco.mj_comVel(self.mjmodel, self._view)
+
+    def _start_rigid(self, body: RigidBody, name: str) -> None:
+        kind = body.joint.kind
+        if kind == "fixed":
+            return
+        address = int(self.mjmodel.jnt_dofadr[self.mjmodel.joint(name).id])
+        axis = np.asarray(body.joint.axis) / np.linalg.norm(body.joint.axis)
+        start = {
+            "free": [*body.velocity, *body.angular_velocity],
+            "ball": list(body.angular_velocity),
+            "hinge": [float(axis @ np.asarray(body.angular_velocity))],
+            "slide": [float(axis @ np.asarray(body.velocity))],
+        }[kind]
+        self.mjdata.qvel[address : address + len(start)] = start
+
+    def _drive(self, time: float, h: float) -> None:
+        """Put moved obstacles and pins where they are at `time`, with the velocity of the `h` s that follow."""
+        for joint, collider in self._moved:
+            assert collider.motion is not None
+            place, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
+            turn, shift = pose_at(collider.motion, time)
+            rotation, position = turn @ collider.rotation, turn @ collider.position + shift
+            x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+            self.mjdata.qpos[place : place + 7] = [*position, w, x, y, z]
+            if h > 0.0:
+                later, moved = pose_at(collider.motion, time + h)
+                spin = Rotation.from_matrix(rotation.T @ later @ collider.rotation).as_rotvec() / h
+                velocity = (later @ collider.position + moved - position) / h
+                self.mjdata.qvel[dof : dof + 6] = [*velocity, *spin]
+        for body, name in zip(self.bodies, self.world.names, strict=True):
+            if isinstance(body, SoftBody):
+                for k, motion in enumerate(body.motions):
+                    mocap = int(self.mjmodel.body_mocapid[self.mjmodel.body(f"{name}_pin{k}").id])
+                    turn, shift = pose_at(motion, time + h)
+                    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+                    self.mjdata.mocap_pos[mocap], self.mjdata.mocap_quat[mocap] = shift, [w, x, y, z]
+
+    def _motion(self, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centres [b, 3], their velocities [b, 3], spins [b, 3] and inertias [b, 3, 3], world axes."""
+        model, data = self.mjmodel, self._view
+        positions = data.xipos[counted]
+        angular, carried = data.cvel[counted, :3], data.cvel[counted, 3:]
+        roots = data.subtree_com[model.body_rootid[counted]]
+        linear = carried + np.cross(angular, positions - roots)
+        axes = data.ximat[counted].reshape(-1, 3, 3)
+        inertia = np.einsum("bik,bk,bjk->bij", axes, model.body_inertia[counted], axes)
+        return positions, linear, angular, inertia
+
+
+def _three(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+__all__ = ["SolverMuJoCo"]

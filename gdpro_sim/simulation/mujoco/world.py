@@ -1,0 +1,232 @@
+"""A compiled scene as one MuJoCo model: ground, obstacles, bodies, and a user's own MJCF under them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from gdpro_sim.errors import MeshError, SceneError
+from gdpro_sim.meshing.convex import decompose, mass_properties
+from gdpro_sim.simulation.colliders import Collider
+from gdpro_sim.simulation.model import Model
+from gdpro_sim.simulation.mujoco import rigid, soft
+from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, add_pair, reference
+from gdpro_sim.simulation.mujoco_model import MujocoWorld, RigidBody, Shape, SoftBody
+
+HEAVY = 1e6
+"""A moved obstacle weighs so many times what all bodies weigh: contact does not turn it from its way."""
+
+CONVEX = 0.99
+"""A mesh that fills this share of its convex hull is taken as convex."""
+
+MEMORY = 64 << 20
+"""Bytes of MuJoCo's stack and contact arena at least; more where there are many points."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A spec and what of it is ours.
+
+    spec:      not yet compiled
+    names:     of every body of `Model.bodies`, as the spec knows it
+    points:    of every soft body, None for a rigid one
+    obstacles: of every collider of `Model.colliders`: the body that is moved, "" where it stands
+    renamed:   (our name, the name taken), where the base had ours already
+    """
+
+    spec: mujoco.MjSpec
+    names: tuple[str, ...]
+    points: tuple[soft.Points | None, ...]
+    obstacles: tuple[str, ...]
+    renamed: tuple[tuple[str, str], ...]
+
+
+def build(model: Model) -> World:
+    """The spec of a model. Raises SceneError for a base that MuJoCo cannot read, and what pins cannot hold."""
+    world = model.mujoco
+    if world is None:
+        raise SceneError("the model has nothing for MuJoCo")
+    spec = _base(world)
+    taken = _names(spec)
+    renamed: list[tuple[str, str]] = []
+
+    def name(wanted: str) -> str:
+        free, k = wanted, 2
+        while free in taken or any(other.startswith(f"{free}_") for other in taken):
+            free, k = f"{wanted}-{k}", k + 1
+        if free != wanted:
+            renamed.append((wanted, free))
+        taken.add(free)
+        return free
+
+    _options(spec, model, world)
+    step = world.settings.timestep
+    geoms: list[
+        tuple[float, list[Any], tuple[float, float]]
+    ] = []  # friction, geoms, solref of each rigid body
+    names, points = [], []
+    for body in world.bodies:
+        title = name(body.name)
+        names.append(title)
+        if isinstance(body, RigidBody):
+            _, shapes = rigid.add_rigid(spec, body, title, step)
+            geoms.append((body.friction, shapes, reference(body.restitution, step)))
+            points.append(None)
+        else:
+            points.append(soft.add_soft(spec, body, title))
+    _pairs(spec, geoms)
+    if model.ground is not None:
+        floor = spec.worldbody.add_geom(name=name("ground"), type=mujoco.mjtGeom.mjGEOM_PLANE)
+        floor.pos, floor.size = [0.0, 0.0, model.ground.height], [0.0, 0.0, 1.0]
+        _passive(floor, 0.0)
+    heavy = HEAVY * max(_weight(world), 1.0)
+    obstacles = []
+    for collider in model.colliders:
+        obstacles.append(_obstacle(spec, collider, name(collider.name), heavy, geoms))
+    return World(spec, tuple(names), tuple(points), tuple(obstacles), tuple(renamed))
+
+
+def compile_spec(spec: mujoco.MjSpec, where: str = "the scene") -> mujoco.MjModel:
+    """Raises SceneError with MuJoCo's own message."""
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise SceneError(f"{where}: MuJoCo cannot compile it: {' '.join(str(error).split())}") from None
+
+
+def _base(world: MujocoWorld) -> mujoco.MjSpec:
+    if world.base is None:
+        spec = mujoco.MjSpec()
+        spec.modelname = "gdpro"
+        return spec
+    if not world.base.is_file():
+        raise SceneError(f"{world.base}: no such file")
+    try:
+        spec = mujoco.MjSpec.from_file(str(world.base))
+        spec.copy().compile()
+    except (ValueError, mujoco.FatalError) as error:
+        message = " ".join(str(error).split())
+        raise SceneError(f"{world.base}: MuJoCo cannot compile it: {message}") from None
+    return spec
+
+
+def _names(spec: mujoco.MjSpec) -> set[str]:
+    """Names of a base that ours must not meet; MuJoCo wants them unique within each kind of thing."""
+    kinds = (spec.bodies, spec.joints, spec.geoms, spec.meshes, spec.flexes)
+    return {item.name for kind in kinds for item in kind if item.name}
+
+
+def _options(spec: mujoco.MjSpec, model: Model, world: MujocoWorld) -> None:
+    option, settings = spec.option, world.settings
+    soft_bodies = [body for body in world.bodies if isinstance(body, SoftBody)]
+    option.timestep, option.gravity = settings.timestep, list(model.gravity)
+    option.iterations, option.tolerance = settings.iterations, settings.tolerance
+    option.impratio = settings.impratio
+    option.cone = (
+        mujoco.mjtCone.mjCONE_ELLIPTIC if settings.cone == "elliptic" else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    )
+    # A state that is not finite is an error of ours to report, never a reason to start anew.
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    if soft_bodies:
+        # Only this integrator takes the elasticity of flexes implicitly.
+        option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+        option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
+        full = any(body.reduction == "full" for body in soft_bodies)
+        option.solver = mujoco.mjtSolver.mjSOL_CG if full else mujoco.mjtSolver.mjSOL_NEWTON
+        count = sum(len(body.vertices) for body in soft_bodies)
+        spec.memory = max(spec.memory, MEMORY + 200_000 * count)
+    elif world.base is None:
+        option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
+        option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+
+
+def _passive(geom: Any, friction: float) -> None:
+    """A geom whose partner decides: friction and stiffness are the larger of two."""
+    from gdpro_sim.simulation.mujoco.contacts import set_contact
+
+    geom.rgba = [0.85, 0.85, 0.85, 1.0]
+    set_contact(geom, friction, FLEX_REFERENCE)
+
+
+def _weight(world: MujocoWorld) -> float:
+    return sum(
+        body.mass if isinstance(body, RigidBody) else float(body.masses.sum()) for body in world.bodies
+    )
+
+
+def _pairs(spec: mujoco.MjSpec, geoms: list[tuple[float, list[Any], tuple[float, float]]]) -> None:
+    """Friction between rigid bodies is the geometric mean of theirs; MuJoCo would take the larger."""
+    for i, (a, shapes, first) in enumerate(geoms):
+        for b, others, second in geoms[i + 1 :]:
+            if a != b:
+                solref = (min(first[0], second[0]), min(first[1], second[1]))
+                for one in shapes:
+                    for other in others:
+                        add_pair(spec, one, other, math.sqrt(a * b), solref)
+
+
+def _obstacle(
+    spec: mujoco.MjSpec,
+    collider: Collider,
+    title: str,
+    heavy: float,
+    geoms: list[tuple[float, list[Any], tuple[float, float]]],
+) -> str:
+    """Geoms of an obstacle; returns the name of the body that moves it, "" where it stands still."""
+    parent, shift = spec.worldbody, collider.position
+    if collider.motion is not None:
+        # A free body of endless weight, put on its way before every step: contact then knows its velocity.
+        parent = spec.worldbody.add_body(name=title, pos=collider.position.tolist(), gravcomp=1.0)
+        parent.quat = rigid.quaternion(collider.rotation)
+        size = max(max(collider.size), 0.1) ** 2
+        rigid.set_mass(parent, heavy, heavy * size * np.eye(3))
+        item = parent.add_joint(name=title, type=mujoco.mjtJoint.mjJNT_FREE)
+        item.align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
+        item.armature, item.frictionloss, item.damping = 0.0, 0.0, [0.0] * 3
+        shift, turn = np.zeros(3), np.eye(3)
+    else:
+        turn = collider.rotation
+    if collider.kind == "plane":
+        geom = parent.add_geom(name=title, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+        geom.pos, geom.quat = shift.tolist(), rigid.quaternion(turn)
+        made = [geom]
+    else:
+        placed = [
+            Shape(s.kind, s.size, turn @ s.position + shift, turn @ s.rotation, s.vertices, s.faces)
+            for s in _shapes(collider)
+        ]
+        made = rigid.add_shapes(spec, parent, tuple(placed), title, 0.0, FLEX_REFERENCE)
+    for geom in made:
+        _passive(geom, collider.friction or 0.0)
+    if collider.friction is not None:
+        for friction, shapes, solref in geoms:
+            for shape in shapes:
+                for geom in made:
+                    add_pair(spec, shape, geom, math.sqrt(friction * collider.friction), solref)
+    return title if collider.motion is not None else ""
+
+
+def _shapes(collider: Collider) -> list[Shape]:
+    if collider.kind == "mesh":
+        assert collider.vertices is not None and collider.faces is not None
+        return mesh_shapes(collider.name, collider.vertices, collider.faces)
+    size = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2}[collider.kind]
+    return [Shape(collider.kind, collider.size[:size])]  # type: ignore[arg-type]
+
+
+def mesh_shapes(name: str, vertices: np.ndarray, faces: np.ndarray) -> list[Shape]:
+    """Convex pieces of an obstacle's mesh; one where it is convex. Raises SceneError."""
+    try:
+        hull = next(iter(decompose(vertices, faces, most=1)))
+        share = mass_properties(vertices, faces).volume / mass_properties(*hull).volume
+        pieces = [hull] if share > CONVEX else list(decompose(vertices, faces))
+    except MeshError as error:
+        raise SceneError(f"collider {name!r}: {error}") from None
+    return [Shape("mesh", vertices=v, faces=f) for v, f in pieces]
+
+
+__all__ = ["World", "build", "compile_spec", "mesh_shapes"]
