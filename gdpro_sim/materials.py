@@ -26,13 +26,32 @@ FLOW_LAWS: tuple[str, ...] = get_args(FlowLaw)
 
 
 def _values(
-    young: float, poisson: float, density: float, friction: float, damping: float, **plastic: float
-) -> dict[str, float]:
+    young: float, poisson: float, density: float, friction: float, damping: float, **more: float | str
+) -> dict[str, float | str]:
     elastic = {"young": young, "poisson": poisson, "density": density}
-    return {**elastic, "friction": friction, "rayleigh_stiffness": damping, **plastic}
+    return {**elastic, "friction": friction, "rayleigh_stiffness": damping, **more}
 
 
-PRESETS: dict[str, dict[str, float]] = {
+def _fluid(bulk: float, viscosity: float, density: float) -> dict[str, float | str]:
+    return {"model": "fluid", "bulk_modulus": bulk, "viscosity": viscosity, "density": density}
+
+
+def _paste(
+    bulk: float, shear: float, density: float, limit: float, consistency: float, index: float
+) -> dict[str, float | str]:
+    """limit: yield stress in shear, Pa, as rheometers give it."""
+    return {
+        "model": "herschel_bulkley",
+        "young": 9.0 * bulk * shear / (3.0 * bulk + shear),
+        "poisson": (3.0 * bulk - 2.0 * shear) / (6.0 * bulk + 2.0 * shear),
+        "density": density,
+        "yield_stress": math.sqrt(3.0) * limit,
+        "viscosity": consistency,
+        "flow_index": index,
+    }
+
+
+PRESETS: dict[str, dict[str, float | str]] = {
     # ---- soft ----
     # Gelatin dessert, 9 parts of water to one of gelatin; and ballistic gelatin, 4 to 1. Compression gives
     # 277 kPa at 2:1 and 4.3 kPa at 20:1, a power law in between (Bonavia 2025, arXiv 2512.20502).
@@ -102,6 +121,39 @@ PRESETS: dict[str, dict[str, float]] = {
     # Solid chocolate and paraffin wax at room temperature, some 0.2 GPa each.
     "chocolate": _values(2.0e8, 0.35, 1300.0, 0.4, 1.0e-4),
     "wax": _values(2.0e8, 0.40, 900.0, 0.3, 1.0e-4),
+    # ---- that flows or tears: for MPM. Volume is softer than in nature, or substeps would be too short ----
+    # White bread crumb in tension: modulus 11 kPa, strength 1 kPa, toughness 4.1 J/m^2 (Scanlon, Sapirstein &
+    # Fahloul 2000, J. Cereal Sci. 32).
+    "tearing_bread": _values(
+        1.1e4, 0.25, 250.0, 0.6, 2.0e-3, model="neo_hookean", tensile_strength=1.0e3, fracture_energy=4.1
+    ),
+    # Dry quartz sand, loose: 30 to 35 degrees, 1.6 t/m^3 (orders of magnitude). As soft as in Klar et al.
+    # 2016; sand in the ground is a hundred times stiffer.
+    "sand": _values(3.5e5, 0.30, 1600.0, 0.6, 0.0, model="drucker_prager", friction_angle=33.0),
+    # Water between the grains: a cohesion of about 1 kPa (Mitarai & Nori 2006, "Wet granular materials",
+    # Adv. Phys. 55: tensile strengths of that order).
+    "wet_sand": _values(
+        3.5e5, 0.30, 1800.0, 0.6, 0.0, model="drucker_prager", friction_angle=33.0, cohesion=1.0e3
+    ),
+    # Stomakhin et al. 2013, ACM TOG 32(4), table 2: "typical".
+    "fresh_snow": _values(1.4e5, 0.20, 400.0, 0.3, 0.0, model="snow"),
+    # Water at 20 C, but for its bulk modulus (2.2 GPa): sound at 22 m/s serves flows up to 2 m/s.
+    "water": _fluid(5.0e5, 1.0e-3, 998.0),
+    # Honey of 16 to 17 % water: 19 Pa s at 21 C, 7 Pa s at 25 C (Krell 1996, "Value-added products from
+    # beekeeping", FAO Agricultural Services Bulletin 124, ch. 2).
+    "honey": _fluid(5.0e5, 1.0e1, 1420.0),
+    # Orders of magnitude: yield stress and fall of viscosity with rate of commercial toothpastes.
+    "toothpaste": _paste(2.0e5, 2.0e3, 1300.0, 1.5e2, 5.0e1, 0.5),
+    # Dry soap foams: shear modulus 240 Pa and yield strain of some tenth at bubbles of 30 um, index near 0.4
+    # (Gillette foam: Gopal & Durian 2003, PRL 91; Denkov et al. 2008, PRL 100); orders of magnitude.
+    "shaving_foam": _paste(2.0e4, 2.4e2, 80.0, 3.0e1, 1.0e1, 0.4),
+    "whipped_cream": _paste(5.0e4, 5.0e2, 400.0, 5.0e1, 2.0e1, 0.4),
+    # Mudflow of silt and clay, 40 % of volume: orders of magnitude of O'Brien & Julien 1988, J. Hydraul. Eng.
+    # 114, who fit Bingham's law.
+    "mud": _paste(3.0e5, 5.0e3, 1660.0, 1.0e2, 1.0e1, 1.0),
+    # Hard wheat flour dough in shear: 1387 Pa s^n, n = 0.38 (J. Food Eng. 103 (2011) 294, capillary
+    # rheometer); modulus and yield stress are orders of magnitude.
+    "dough": _paste(5.0e5, 1.0e4, 1200.0, 5.0e2, 1.387e3, 0.38),
 }
 """Named presets. Sources stand beside each; friction is against a dry floor, damping is chosen."""
 

@@ -343,7 +343,7 @@ _PRINCIPAL = """
         }
         const F widest = x[0];
         const F shear = select(corotated, mu + mu, mu) * (1.0f + widest);
-        stiff = select((neo | stable | corotated), stiff + shear, stiff);
+        stiff = select(principal & (neo | stable | corotated), stiff + shear, stiff);
         I flows = zero > 1.0f;
 
         if (any(hencky)) {
@@ -436,7 +436,7 @@ _PRINCIPAL = """
             damage = select(tears & (past > 0.0f), torn, zero);
             for (int i = 0; i < 3; ++i) {
                 t[i] = select(tears & (t[i] > 0.0f), t[i] * (1.0f - damage), t[i]);
-                const I wide_open = tears & (damage > 0.99f) & (s[i] > 2.0f);
+                const I wide_open = tears & (damage > 0.99f) & (s[i] * (back[i] + 1.0f) > 2.0f);
                 back[i] = select(wide_open, 2.0f / s[i] - 1.0f, back[i]);
                 flows = flows | wide_open;
             }
