@@ -121,7 +121,7 @@ def convert(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Turn a PhysGaussian configuration into a scene; what the scene does not follow is said in a line each."""
+    """Turn a PhysGaussian configuration into a scene; each thing the scene does not follow is named."""
     setup(quiet, debug)
     check_exists(config)
     check_exists(asset)

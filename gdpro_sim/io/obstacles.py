@@ -106,7 +106,10 @@ def _surface(collider: Collider, low: np.ndarray, high: np.ndarray) -> tuple[np.
         shape = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[48, 48])
         shape.apply_translation((0.0, 0.0, -float(shape.bounds.mean(axis=0)[2])))
     else:
-        shape = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=64)
+        shape = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=48)
+        # The fans of its ends are needles.
+        corners, faces = trimesh.remesh.subdivide_to_size(shape.vertices, shape.faces, 0.25 * size[0])
+        return np.asarray(corners), np.asarray(faces, np.int32)
     return np.asarray(shape.vertices), np.asarray(shape.faces, np.int32)
 
 

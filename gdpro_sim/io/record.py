@@ -51,11 +51,14 @@ Progress = Callable[[str, int, int], None]
 RESUME_FORMAT = 2
 """Raise it when frames of an earlier version must not be continued."""
 
-ELSEWHERE: dict[str, tuple[str, ...]] = {
-    "fem": (),
-    "mpm": ("newton_iterations", "cg_iterations", "residual", "converged", "force_energy"),
-}
-"""Figures that mean nothing for a solver: its metrics leave them out."""
+IMPLICIT = ("newton_iterations", "cg_iterations", "residual", "converged", "contact_energy", "force_energy")
+"""Figures that the explicit MPM has not: its metrics leave them out."""
+
+SPREAD = 0.4
+"""How far to each side pictures expect matter to flow, as a multiple of its height at the start."""
+
+WIDE = 6.0
+"""Walls this many times further apart than a body is wide are not shown whole."""
 
 PHASES = ("solve", "resplat", "render", "write")
 
@@ -179,6 +182,7 @@ def _run(
 ) -> list[dict[str, Any]]:
     """Every frame: solve (or take it from an interrupted run), re-splat, draw, write."""
     total = len(simulation)
+    explicit = simulation.model.particles is not None and simulation.model.mpm.integrator == "explicit"
     rows: list[dict[str, Any]] = []
     report("simulate", 0, total)
     simulation.solver.reset()
@@ -227,7 +231,7 @@ def _run(
                 "render": 1e3 * (drawn - begin),
                 "write": 1e3 * (written - drawn),
             }
-            rows.append(_row(index, diagnostics, milliseconds, ELSEWHERE[scene.solver.kind]))
+            rows.append(_row(index, diagnostics, milliseconds, IMPLICIT if explicit else ()))
             report("simulate", index + 1, total)
         report("usd", 0, 0)
         begin = time.perf_counter()
@@ -289,6 +293,8 @@ def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray
         friction = material_of(body, simulation.assets[body.name]).friction
         for shift in _path(scene, body, low, float((high - low).max()), friction):
             boxes.append((low + shift, high + shift))
+        if placed.patches is not None:
+            boxes.append(_spread(boxes[-1], simulation.model.mpm.domain))
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
     low, high = with_obstacles(simulation.model.colliders, low, high)
     if scene.ground is not None:
@@ -296,6 +302,22 @@ def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray
         spread_out = 0.12 * (high[:2] - low[:2])
         low[:2] -= spread_out
         high[:2] += spread_out
+    return low, high
+
+
+def _spread(
+    box: tuple[np.ndarray, np.ndarray], domain: tuple[tuple[float, ...], tuple[float, ...]] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where matter that flows may come to lie: as far again as it is high, or as walls let it."""
+    low, high = box[0].copy(), box[1].copy()
+    reach = SPREAD * float(high[2] - low[2])
+    low[:2] -= reach
+    high[:2] += reach
+    if domain is not None:
+        walls = np.asarray(domain)[:, :2]
+        wide = np.ptp(walls, axis=0) > WIDE * np.ptp(np.stack(box), axis=0)[:2]
+        low[:2] = np.where(wide, np.maximum(low[:2], walls[0]), walls[0])
+        high[:2] = np.where(wide, np.minimum(high[:2], walls[1]), walls[1])
     return low, high
 
 

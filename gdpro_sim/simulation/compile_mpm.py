@@ -277,7 +277,9 @@ def _check_cells(scene: Scene, particles: Particles, settings: MpmSettings, spac
 
 
 def _check_substeps(scene: Scene, particles: Particles, settings: MpmSettings, spacing: float) -> None:
-    """Raise SceneError where sound alone asks for more substeps a frame than allowed."""
+    """Raise SceneError where sound alone asks for more explicit substeps a frame than allowed."""
+    if settings.integrator != "explicit":
+        return
     # Imported here: it brings the solver's kernels.
     from gdpro_sim.simulation.mpm.matter import largest_step, sound_speed
 
@@ -291,7 +293,7 @@ def _check_substeps(scene: Scene, particles: Particles, settings: MpmSettings, s
                 f"{scene.name}: {name} of {material.young:.3g} Pa, damping {material.rayleigh_stiffness:.3g} "
                 f"s, would take {count:,.0f} substeps a frame on cells of {spacing:.3g} m (at most "
                 f"{settings.max_substeps:,}): lower `young` or `rayleigh_stiffness`, use fewer particles, or "
-                "the FEM solver"
+                "the implicit integrator"
             )
 
 

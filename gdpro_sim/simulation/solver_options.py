@@ -84,6 +84,22 @@ class MpmOptions(Options):
         description="cells that sound and particles may cross in a substep",
     )  # fmt: skip
     max_substeps: int = Field(default=MpmSettings.max_substeps, ge=1, description="per frame, at most")
+    substeps: int = Field(
+        default=MpmSettings.substeps, ge=1, le=1000, description="implicit steps per frame at least"
+    )
+    newton_iterations: int = Field(
+        default=MpmSettings.newton_iterations, ge=1, le=1000, description="at most, per implicit substep"
+    )
+    newton_tolerance: float = Field(
+        default=MpmSettings.newton_tolerance, gt=0.0, description="largest node speed correction, m/s"
+    )
+    cg_iterations: int = Field(
+        default=MpmSettings.cg_iterations, ge=1, description="at most, per Newton iteration"
+    )
+    cg_tolerance: float = Field(
+        default=MpmSettings.cg_tolerance, gt=0.0, lt=1.0,
+        description="relative residual of inner conjugate gradients",
+    )  # fmt: skip
     domain: tuple[Vector, Vector] | None = Field(
         default=None, description="lower and upper corner of a closed box, m; default: no walls"
     )
