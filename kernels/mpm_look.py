@@ -28,9 +28,11 @@ def within(F: wp.mat33, stretch: float, anisotropy: float) -> bool:
 
 @wp.func
 def bounded(F: wp.mat33, stretch: float, anisotropy: float) -> wp.mat33:
-    """F with singular values in [1 / stretch, stretch], the largest at most `anisotropy` times the least.
+    """F with singular values s0 >= s1 >= s2 in [1 / stretch, stretch] and s0 <= anisotropy * s2.
 
-    A reflection becomes a rotation; what is not finite, the identity.
+    What is pulled one way is cut short: no needles. What is pulled two ways, as matter that spreads in a thin
+    layer, is thickened instead, so that it covers as much. A reflection becomes a rotation; what is not
+    finite, the identity.
     """
     if within(F, stretch, anisotropy):
         return F
@@ -40,14 +42,10 @@ def bounded(F: wp.mat33, stretch: float, anisotropy: float) -> wp.mat33:
     U, s, V = singular_value_decomposition(wp.mat33d(F))
     most = wp.float64(stretch)
     least = wp.float64(1.0) / most
-    s0 = wp.clamp(s[0], least, most)
+    ratio = wp.float64(anisotropy)
     s1 = wp.clamp(s[1], least, most)
-    s2 = wp.clamp(s[2], least, most)
-    # The bound is met from both ends, about the geometric mean: continuous, and volume changes least.
-    excess = wp.max(s0 / (s2 * wp.float64(anisotropy)), wp.float64(1.0))
-    s0 = s0 / wp.sqrt(excess)
-    s2 = s2 * wp.sqrt(excess)
-    s1 = wp.clamp(s1, s2, s0)
+    s0 = wp.min(wp.clamp(s[0], least, most), ratio * s1)
+    s2 = wp.max(wp.clamp(s[2], least, most), s0 / ratio)
     return wp.mat33(U * wp.diag(wp.vec3d(s0, s1, s2)) * wp.transpose(V))
 
 

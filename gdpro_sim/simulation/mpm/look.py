@@ -64,7 +64,7 @@ class Look:
     positions:  [n, 3] float32 m, rest
     patches:    [V] int32 ascending, the patch of each vertex (`unweld`), or None: the surface stays whole
     stretch:    patches: they grow to this much of their size along an axis at most, and shrink to its inverse
-    anisotropy: patches: longest over shortest stretch at most
+    anisotropy: patches: longest over shortest stretch at most; one pulled longer than it is wide is cut short
     device:     where to compute; the result is the same for any number of threads
 
     Bit-exact at rest. Exact for affine motion, in patches within the bounds, whole up to a stretch of 8.
@@ -76,8 +76,8 @@ class Look:
         positions: np.ndarray,
         *,
         patches: np.ndarray | None = None,
-        stretch: float = 2.0,
-        anisotropy: float = 3.0,
+        stretch: float = 4.0,
+        anisotropy: float = 2.5,
         device: str = "cpu",
     ) -> None:
         if not len(positions):
