@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 WORKER = "gdpro_sim.meshing.convex_worker"
 TIME_LIMIT = 300.0
 FACES = 2_000
-"""A finer mesh is decimated to this many faces before it is decomposed: pieces are coarser than that anyway."""
+"""A finer mesh is decimated to this many faces before it is decomposed: pieces are coarser anyway."""
 
 PrimitiveKind = Literal["box", "sphere", "capsule", "cylinder"]
 PRIMITIVES: tuple[str, ...] = get_args(PrimitiveKind)
@@ -90,8 +90,8 @@ class Primitive:
 def mass_properties(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
     """Exact volume integrals of a closed mesh, [V, 3] m and [F, 3] outward, in float64.
 
-    Mirtich 1996, "Fast and Accurate Computation of Polyhedral Mass Properties", J. Graphics Tools 1, as trimesh
-    evaluates them. Raises MeshError for a mesh that is not closed or encloses nothing.
+    Mirtich 1996, "Fast and Accurate Computation of Polyhedral Mass Properties", J. Graphics Tools 1, as
+    trimesh evaluates them. Raises MeshError for a mesh that is not closed or encloses nothing.
     """
     report = validate(vertices, faces)
     if not report.watertight or report.volume <= 0.0:
@@ -153,12 +153,12 @@ def decompose(
     low, high = v.min(axis=0), v.max(axis=0)
     centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
     started = time.monotonic()
-    points, triangles, counts = _run((v - centre) / size, f, threshold, most or -1, seed, time_limit)
+    points, counts = _run((v - centre) / size, f, threshold, most or -1, seed, time_limit)
     if not len(counts):
         raise MeshError("convex decomposition found no piece: the mesh encloses no volume; give it thickness")
     # Hulls anew: what CoACD returns may be flat or not closed where pieces are thin.
-    ends = np.cumsum(counts[:, 0])
-    hulls = [_hull(points[end - n : end] * size + centre) for end, n in zip(ends, counts[:, 0], strict=True)]
+    ends = np.cumsum(counts)
+    hulls = [_hull(points[end - n : end] * size + centre) for end, n in zip(ends, counts, strict=True)]
     pieces = _joined([hull for hull in hulls if hull is not None])
     logger.info("%d faces in %d convex pieces in %.1f s", len(f), len(pieces), time.monotonic() - started)
     return pieces
@@ -188,8 +188,8 @@ def _joined(hulls: list[tuple[np.ndarray, np.ndarray] | None]) -> ConvexPieces:
 
 def _run(
     vertices: np.ndarray, faces: np.ndarray, threshold: float, most: int, seed: int, time_limit: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """CoACD in a subprocess, which is killed at the time limit and on any interruption."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and counts of CoACD in a subprocess, killed at the time limit and on any interruption."""
     with tempfile.TemporaryDirectory(prefix="gdpro-convex-") as folder:
         source, target = Path(folder, "in.npz"), Path(folder, "out.npz")
         np.savez(
@@ -206,8 +206,8 @@ def _run(
             _, errors = process.communicate(timeout=time_limit)
         except subprocess.TimeoutExpired:
             raise MeshError(
-                f"convex decomposition passed its time limit of {time_limit:g} s; raise the threshold, simplify "
-                "the mesh, or take a primitive"
+                f"convex decomposition passed its time limit of {time_limit:g} s; raise the threshold, "
+                "simplify the mesh, or take a primitive"
             ) from None
         finally:
             if process.poll() is None:
@@ -218,11 +218,11 @@ def _run(
         if process.returncode != 0 or not target.is_file():
             lines = errors.decode("utf-8", "replace").strip().splitlines()
             raise MeshError(
-                f"convex decomposition failed ({lines[-1][:200] if lines else process.returncode}); repair the "
-                "mesh, or take a primitive"
+                f"convex decomposition failed ({lines[-1][:200] if lines else process.returncode}); repair "
+                "the mesh, or take a primitive"
             )
         with np.load(target, allow_pickle=False) as data:
-            return data["vertices"], data["faces"], data["counts"]
+            return data["vertices"], data["counts"]
 
 
 # ---- primitives ----

@@ -1,9 +1,8 @@
 """Runs CoACD in a process of its own: `python -m gdpro_sim.meshing.convex_worker in.npz out.npz`.
 
 CoACD is native code, prints what it does, and can run for a long time. The input holds `vertices` float64
-[V, 3], `faces` int32 [F, 3], `threshold`, `most` (pieces; -1 for any number), `seed` and `seconds`; the output
-holds the pieces joined: `vertices` float64 [P, 3], `faces` int32 [Q, 3] that count from a piece's first vertex,
-and `counts` int64 [n, 2], vertices and faces of each piece.
+[V, 3], `faces` int32 [F, 3], `threshold`, `most` (pieces; -1 for any number), `seed` and `seconds`; the
+output holds the pieces' `vertices` float64 [P, 3], piece after piece, and `counts` int64 [n] of them.
 """
 
 from __future__ import annotations
@@ -38,12 +37,10 @@ def main(source: str, target: str) -> None:
             max_ch_vertex=64,
         )
     vertices = [np.asarray(v, np.float64).reshape(-1, 3) for v, _ in pieces]
-    faces = [np.asarray(f, np.int32).reshape(-1, 3) for _, f in pieces]
     np.savez(
         target,
         vertices=np.concatenate([np.zeros((0, 3)), *vertices]),
-        faces=np.concatenate([np.zeros((0, 3), np.int32), *faces]),
-        counts=np.array([[len(v), len(f)] for v, f in zip(vertices, faces, strict=True)], np.int64),
+        counts=np.array([len(v) for v in vertices], np.int64),
     )
 
 

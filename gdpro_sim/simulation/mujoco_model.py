@@ -1,4 +1,4 @@
-"""What MuJoCo simulates, compiled: constant arrays in float64, SI units, world space. Nothing here needs MuJoCo.
+"""What MuJoCo simulates, compiled: constant arrays in float64, SI units, world space.
 
 Bodies stand in the order of `Model.bodies`.
 """
@@ -126,7 +126,7 @@ class MujocoSettings:
     timestep: float = 1e-3
     iterations: int = 100
     tolerance: float = 1e-8
-    impratio: float = 10.0
+    impratio: float = 100.0
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
 
 

@@ -1,7 +1,7 @@
 """Friction and restitution as MuJoCo takes them.
 
-A contact is a spring and a dashpot on the relative acceleration: a = -k r - b v while it pushes (`solref` given
-as (-k, -b)). All rigid bodies share k, so that of two bodies the less bouncy one, with the larger b, counts.
+A contact is a spring and a dashpot on the relative acceleration: a = -k r - b v while it pushes (`solref`
+given as (-k, -b)). All rigid bodies share k: of two bodies the less bouncy one, with the larger b, counts.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ STEPS = 0.15
 PHASES = 64
 """Begins of an impact within a step that are averaged."""
 
-LEAST = 0.05
-"""A smaller restitution would ask for more damping than a step can take."""
+LEAST = 0.15
+"""A smaller restitution asks for so much damping in a step that sliding bodies hop."""
 
-IMPEDANCE = (0.998, 0.998, 0.001, 0.5, 2.0)
-"""`solimp`: nearly rigid, at any depth."""
+SHARE = 0.95
+"""`solimp`: the share of the spring's acceleration in a contact's. Nearer to 1, what slides chatters."""
+
+IMPEDANCE = (SHARE, SHARE, 0.001, 0.5, 2.0)
 
 FLEX_REFERENCE = (0.01, 1.0)
 """`solref` of what touches a flex: time constant in s, and damping ratio."""
@@ -33,8 +35,7 @@ def restitution_of(damping: float) -> float:
     """Speed after an impact over speed before, of a damping ratio b / (2 sqrt(k)), in steps of `STEPS`.
 
     The mean over where in a step the impact begins. In the limit of short steps it is that of a spring and
-    dashpot that never pull (Schwager & Poeschel 2007, Granular Matter 9); damping taken at a step's begin stops
-    a little more.
+    dashpot that never pull (Schwager & Poeschel 2007, Granular Matter 9).
     """
     r = -STEPS * (np.arange(PHASES) + 0.5) / PHASES  # in units of speed over frequency
     v = np.full(PHASES, -1.0)
@@ -55,7 +56,7 @@ def damping_of(restitution: float) -> float:
 def reference(restitution: float, timestep: float) -> tuple[float, float]:
     """`solref` of a rigid body: (-k, -b)."""
     omega = STEPS / timestep
-    return -omega * omega, -2.0 * damping_of(max(restitution, LEAST)) * omega
+    return -omega * omega * SHARE, -2.0 * damping_of(max(restitution, LEAST)) * omega
 
 
 def set_contact(item: Any, friction: float, solref: tuple[float, float], *, condim: int = 3) -> None:
@@ -79,6 +80,7 @@ def add_pair(spec: mujoco.MjSpec, a: Any, b: Any, friction: float, solref: tuple
 __all__ = [
     "FLEX_REFERENCE",
     "IMPEDANCE",
+    "LEAST",
     "add_pair",
     "damping_of",
     "reference",

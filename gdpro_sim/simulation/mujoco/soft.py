@@ -113,7 +113,7 @@ def _of_nodes(
     total = body.masses.sum()
     if body.reduction == "trilinear":
         masses = body.masses @ weights
-    else:  # row sums of quadratic functions may be negative: diagonal scaling (Hinton, Rock & Zienkiewicz 1976)
+    else:  # row sums may be negative; diagonal scaling is not (Hinton, Rock & Zienkiewicz 1976)
         masses = body.masses @ weights**2
     masses = np.maximum(masses, LEAST_NODE * total / weights.shape[1])
     masses *= total / masses.sum()

@@ -250,7 +250,7 @@ class SolverMuJoCo:
         self.mjdata.qvel[address : address + len(start)] = start
 
     def _drive(self, time: float, h: float) -> None:
-        """Put moved obstacles and pins where they are at `time`, with the velocity of the `h` s that follow."""
+        """Put moved obstacles and pins where they are at `time`, moving as in the `h` s that follow."""
         for joint, collider in self._moved:
             assert collider.motion is not None
             place, dof = int(joint.qposadr[0]), int(joint.dofadr[0])

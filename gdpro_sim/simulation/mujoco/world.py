@@ -14,7 +14,7 @@ from gdpro_sim.meshing.convex import decompose, mass_properties
 from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mujoco import rigid, soft
-from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, add_pair, reference
+from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, LEAST, add_pair, reference, set_contact
 from gdpro_sim.simulation.mujoco_model import MujocoWorld, RigidBody, Shape, SoftBody
 
 HEAVY = 1e6
@@ -46,7 +46,7 @@ class World:
 
 
 def build(model: Model) -> World:
-    """The spec of a model. Raises SceneError for a base that MuJoCo cannot read, and what pins cannot hold."""
+    """The spec of a model. Raises SceneError for a base that MuJoCo cannot read, or pins it cannot hold."""
     world = model.mujoco
     if world is None:
         raise SceneError("the model has nothing for MuJoCo")
@@ -68,7 +68,8 @@ def build(model: Model) -> World:
     geoms: list[
         tuple[float, list[Any], tuple[float, float]]
     ] = []  # friction, geoms, solref of each rigid body
-    names, points = [], []
+    names: list[str] = []
+    points: list[soft.Points | None] = []
     for body in world.bodies:
         title = name(body.name)
         names.append(title)
@@ -140,14 +141,14 @@ def _options(spec: mujoco.MjSpec, model: Model, world: MujocoWorld) -> None:
         count = sum(len(body.vertices) for body in soft_bodies)
         spec.memory = max(spec.memory, MEMORY + 200_000 * count)
     elif world.base is None:
-        option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICIT
-        option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        # What slides chatters least with the discrete one, but it takes a fifth of every bounce's speed.
+        bouncy = any(b.restitution > LEAST for b in world.bodies if isinstance(b, RigidBody))
+        kind = mujoco.mjtIntegrator.mjINT_IMPLICIT if bouncy else mujoco.mjtIntegrator.mjINT_DISCRETE
+        option.integrator, option.solver = kind, mujoco.mjtSolver.mjSOL_NEWTON
 
 
 def _passive(geom: Any, friction: float) -> None:
     """A geom whose partner decides: friction and stiffness are the larger of two."""
-    from gdpro_sim.simulation.mujoco.contacts import set_contact
-
     geom.rgba = [0.85, 0.85, 0.85, 1.0]
     set_contact(geom, friction, FLEX_REFERENCE)
 
