@@ -29,6 +29,9 @@ MAX_HALVINGS = 20
 ROUNDING = 2.0**-23
 """Of float32, relative."""
 
+SETTLED = 4.0
+"""Multiple of `newton_tolerance` that the last look at the boundaries may have changed a velocity by."""
+
 
 class Outcome(NamedTuple):
     """residual: m/s, of the last Newton step, as if nodes had a full cell's mass"""
@@ -111,18 +114,19 @@ class GridNewton:
         wp.copy(self._momentum, grid.values)
         wp.copy(self._target, grid.values)
         speed = self._measure(self._momentum)[1]
-        energy = self._choose_start(h, change)
-        self._iterations, residual, done = 0, math.inf, 0
-        while done < settings.newton_iterations:
+        scale = max(speed, math.hypot(*change), 1e-6)
+        energy = self._choose_start(h, change, scale)
+        self._iterations, residual, done, following = 0, math.inf, 0, bool(self.boundaries)
+        while done < settings.newton_iterations and math.isfinite(energy):
             self.linearise(h)
             jump = 0.0
-            if self.boundaries:
-                jump = self._meet_boundaries(h, speed + h * math.hypot(*change))
+            if following:
+                jump = self._meet_boundaries(h, scale)
                 energy = self.energy(h)
+                if not math.isfinite(energy):
+                    break
                 if jump > 0.0:
                     self.linearise(h)
-            if not math.isfinite(energy):
-                break
             self.set_right_hand_side()
             solved = self.solve_linear()
             slope, move = self._measure(self._step)
@@ -134,8 +138,11 @@ class GridNewton:
             length, energy = self._line_search(h, energy, slope, self._noise(h, energy, speed))
             if length == 0.0:
                 break
-            if solved and length == 1.0 and residual <= settings.newton_tolerance:
-                return Outcome(True, True, residual, done, self._iterations)
+            if solved and length == 1.0:
+                if residual <= settings.newton_tolerance:
+                    return Outcome(True, True, residual, done, self._iterations)
+                # The last iterations descend on one fixed energy.
+                following &= residual > SETTLED * settings.newton_tolerance
         return Outcome(False, math.isfinite(energy), residual, done, self._iterations)
 
     def _noise(self, h: float, energy: float, speed: float) -> float:
@@ -145,11 +152,18 @@ class GridNewton:
         inertial = ROUNDING * speed * math.sqrt(self._mass)
         return elastic**2 + 2.0 * math.sqrt(abs(energy)) * (elastic + inertial)
 
-    def _choose_start(self, h: float, change: Sequence[float]) -> float:
-        """Put the guess of lowest energy into the grid: falling, coasting, or all as one; its energy."""
-        guesses = [(wp.vec3(), 1.0), (wp.vec3(*(-x for x in change)), 1.0)]
-        if not any(change):
-            guesses.pop()
+    def _choose_start(self, h: float, change: Sequence[float], scale: float) -> float:
+        """Put the guess of lowest energy into the grid: coasting, falling, or all as one; its energy."""
+        if self.boundaries:
+            # What is in the way of a body at rest shows in the forces that hold it up.
+            self._projectors.fill_(wp.mat33(*np.eye(3).ravel()))
+            self._held.zero_()
+            if math.isfinite(self._guess(h, wp.vec3(*(-x for x in change)), 1.0)):
+                self.linearise(h)
+                self._meet_boundaries(h, scale)
+        guesses = [(wp.vec3(*(-x for x in change)), 1.0)]
+        if any(change):
+            guesses.append((wp.vec3(), 1.0))
         energies = [self._guess(h, *guess) for guess in guesses]
         best = int(np.argmin(energies))
         if not math.isfinite(energies[best]):
@@ -162,6 +176,8 @@ class GridNewton:
 
     def _guess(self, h: float, v: wp.vec3, weight: float) -> float:
         self._over_nodes(mpm_newton.fill, [v, weight, self._momentum], [self.grid.values])
+        if self.boundaries:
+            self._hold()
         energy = self.energy(h)
         return energy if math.isfinite(energy) else math.inf
 
@@ -305,21 +321,29 @@ class GridNewton:
         wp.copy(grid.values, u)
         self._apply(h)
         wp.copy(self._bounded, grid.values)
-        scale = max(scale, 1e-6)
+        self._over_nodes(mpm_newton.combine, [u, -1.0, self._bounded], [self._step])
+        if self._measure(self._step)[1] == 0.0:
+            # Nothing is in the way.
+            self._projectors.fill_(wp.mat33(*np.eye(3).ravel()))
+            wp.copy(self._target, self._momentum)
+            wp.copy(grid.values, values)
+            return 0.0
         for k in range(3):
             self._over_nodes(mpm_newton.probe, [k, scale, u, self._bounded], [grid.values])
             self._apply(h)
-            self._over_nodes(
-                mpm_newton.differentiate,
-                [k, scale, u, self._bounded, grid.values],
-                [self._projectors],
-            )
+            inputs = [k, scale, u, self._bounded, grid.values]
+            self._over_nodes(mpm_newton.differentiate, inputs, [self._projectors])
         self._over_nodes(
             mpm_newton.constrain,
             [u, self._bounded, self._momentum],
             [self._projectors, self._held, self._target],
         )
         wp.copy(grid.values, values)
+        return self._hold()
+
+    def _hold(self) -> float:
+        """Give nodes the velocities that they are held at; by how much that changed one, m/s."""
+        grid = self.grid
         grid.launch(
             mpm_newton.hold,
             RANGES,
