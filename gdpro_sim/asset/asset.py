@@ -18,6 +18,7 @@ from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.errors import AssetError
 from gdpro_sim.gaussians import sh_to_rgb
 from gdpro_sim.materials import Material
+from gdpro_sim.meshing.convex import ConvexPieces
 from gdpro_sim.meshing.tetmesh import Embedding, TetMesh
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,7 @@ class Asset:
     tets:          tetrahedra around the mesh, or None for an asset that is only shown
     embedding:     where the mesh's vertices sit in `tets`; present exactly when `tets` is
     material:      proposed by whoever made the asset, overridable in a scene
+    pieces:        convex pieces for rigid contact, or None where nobody has needed them yet
     provenance:    JSON values: source file, SHA-256, versions, seed, command
 
     Raises AssetError where the parts do not fit together.
@@ -47,6 +49,7 @@ class Asset:
     embedding: Embedding | None = None
     material: Material | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
+    pieces: ConvexPieces | None = None
 
     def __post_init__(self) -> None:
         _check_binding(self.name, self.gaussians)
@@ -58,6 +61,8 @@ class Asset:
         if self.tets is not None and self.embedding is not None:
             _check_tets(self.name, self.tets)
             _check_embedding(self.name, self.embedding, vertex_count, len(self.tets.tets))
+        if self.pieces is not None:
+            _check_pieces(self.name, self.pieces)
         try:
             normal = json.loads(json.dumps(self.provenance, allow_nan=False))
         except (TypeError, ValueError) as error:
@@ -91,7 +96,7 @@ class Asset:
             return asset
 
     def scaled(self, factor: float) -> Asset:
-        """The asset resized uniformly by `factor` > 0: mesh, Gaussians and tets. Raises AssetError."""
+        """The asset resized uniformly by `factor` > 0: all its parts. Raises AssetError."""
         if not (math.isfinite(factor) and factor > 0.0):
             raise AssetError(f"asset {self.name!r}: scale must be a finite number > 0, got {factor}")
         if factor == 1.0:
@@ -99,7 +104,8 @@ class Asset:
         tets = self.tets
         if tets is not None:
             tets = replace(tets, vertices=tets.vertices * np.float32(factor))
-        return replace(self, gaussians=self.gaussians.scaled(factor), tets=tets)
+        pieces = None if self.pieces is None else self.pieces.scaled(factor)
+        return replace(self, gaussians=self.gaussians.scaled(factor), tets=tets, pieces=pieces)
 
     def summary(self) -> dict[str, Any]:
         """What the asset holds, as JSON values: counts, size in m, volume in m^3, mass in kg, material."""
@@ -125,6 +131,8 @@ class Asset:
             result["volume"] = volume
             if self.material is not None:
                 result["mass"] = volume * self.material.density
+        if self.pieces is not None:
+            result["convex_pieces"] = len(self.pieces)
         if self.material is not None:
             result["material"] = self.material.model_dump()
         result["provenance"] = self.provenance
@@ -202,6 +210,14 @@ def _check_embedding(asset: str, embedding: Embedding, vertex_count: int, tet_co
     _check_sums(asset, "embedding.weights", embedding.weights)
 
 
+def _check_pieces(asset: str, pieces: ConvexPieces) -> None:
+    n, m = (int(x) for x in pieces.counts.sum(axis=0))
+    _check_array(asset, "pieces.vertices", pieces.vertices, np.float32, (n, 3))
+    _check_array(asset, "pieces.faces", pieces.faces, np.int32, (m, 3))
+    for k, (vertices, faces) in enumerate(pieces):
+        _check_indices(asset, f"pieces[{k}].faces", faces, len(vertices), "vertices")
+
+
 # ---- file ----
 
 
@@ -219,6 +235,8 @@ def _digest(asset: Asset) -> str:
     if asset.tets is not None and asset.embedding is not None:
         arrays += [asset.tets.vertices, asset.tets.tets, asset.tets.fill]
         arrays += [asset.embedding.tet_ids, asset.embedding.weights]
+    if asset.pieces is not None:
+        arrays += [asset.pieces.vertices, asset.pieces.faces, asset.pieces.counts]
     for array in arrays:
         result.update(np.ascontiguousarray(array).data)
     return result.hexdigest()
@@ -251,6 +269,8 @@ def _author(layer: Sdf.Layer, asset: Asset) -> None:
         embedding = asset.embedding
         stage.set_custom(mesh, "gdpro:embedding:tetIds", prims.T.IntArray, prims.ints(embedding.tet_ids))
         stage.set_custom(mesh, "gdpro:embedding:weights", prims.T.Float4Array, prims.vec4f(embedding.weights))
+    if asset.pieces is not None:
+        prims.define_pieces(usd_stage, parent, asset.pieces)
     if asset.material is not None:
         prims.define_material(usd_stage, parent, asset.material, tets)
 
@@ -261,6 +281,7 @@ def _read(usd_stage: Usd.Stage, root: Usd.Prim) -> Asset:
     splats = usd_stage.GetPrimAtPath(path.AppendChild("Splats"))
     tet_prim = usd_stage.GetPrimAtPath(path.AppendChild("Tets"))
     material_prim = usd_stage.GetPrimAtPath(path.AppendChild("PhysicsMaterial"))
+    pieces_prim = usd_stage.GetPrimAtPath(path.AppendChild("Pieces"))
     for name, prim in (("Mesh", mesh), ("Splats", splats)):
         if not prim:
             raise AssetError(f"prim {path.AppendChild(name)} is missing; the file is damaged")
@@ -289,6 +310,7 @@ def _read(usd_stage: Usd.Stage, root: Usd.Prim) -> Asset:
         embedding=embedding,
         material=prims.read_material(material_prim) if material_prim else None,
         provenance=provenance,
+        pieces=prims.read_pieces(pieces_prim) if pieces_prim else None,
     )
 
 

@@ -21,6 +21,7 @@ from gdpro_sim.errors import AssetError, MeshError
 from gdpro_sim.gaussians import Gaussians, sh_to_rgb
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.color import srgb_to_linear
+from gdpro_sim.meshing.convex import ConvexPieces
 from gdpro_sim.meshing.tetmesh import TetMesh
 
 Precision = Literal["float", "half"]
@@ -344,6 +345,30 @@ def read_material(prim: Usd.Prim) -> Material:
         raise AssetError(f"{_where(prim)}: gdpro:material is not a material: {reason}") from error
 
 
+# ---- convex pieces ----
+
+
+def define_pieces(stage: Usd.Stage, parent: Sdf.Path, pieces: ConvexPieces) -> Usd.Prim:
+    """The convex pieces that stand for the mesh in rigid contact."""
+    prim = UsdGeom.Scope.Define(stage, parent.AppendChild("Pieces")).GetPrim()
+    set_custom(prim, "gdpro:pieces:vertices", T.Point3fArray, vec3f(pieces.vertices))
+    set_custom(prim, "gdpro:pieces:faces", T.IntArray, ints(pieces.faces))
+    set_custom(prim, "gdpro:pieces:counts", T.IntArray, ints(pieces.counts))
+    set_custom(prim, "gdpro:pieces:concavity", T.Double, pieces.concavity)
+    return prim
+
+
+def read_pieces(prim: Usd.Prim) -> ConvexPieces:
+    """The pieces as written. Raises AssetError."""
+    counts = read(prim, "gdpro:pieces:counts", np.int32, (-1,))
+    vertices = read(prim, "gdpro:pieces:vertices", np.float32, (-1, 3))
+    faces = read(prim, "gdpro:pieces:faces", np.int32, (-1,))
+    concavity = prim.GetAttribute("gdpro:pieces:concavity").Get()
+    if len(counts) % 2 or len(faces) % 3 or concavity is None:
+        raise AssetError(f"{_where(prim)}: the convex pieces are damaged")
+    return ConvexPieces(vertices, faces.reshape(-1, 3), counts.reshape(-1, 2), float(concavity))
+
+
 # ---- reading ----
 
 
@@ -385,12 +410,14 @@ __all__ = [
     "bounds",
     "define_material",
     "define_mesh",
+    "define_pieces",
     "define_tets",
     "floats",
     "ints",
     "read",
     "read_binding",
     "read_material",
+    "read_pieces",
     "read_splats",
     "read_tets",
     "set_mesh",

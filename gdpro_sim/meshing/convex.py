@@ -9,12 +9,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-import trimesh
 from scipy.optimize import brentq
 
 from gdpro_sim.errors import MeshError
@@ -54,23 +54,25 @@ class ConvexPieces:
     vertices: [P, 3] float32 m, piece after piece
     faces:    [Q, 3] int32, outward, counted from their piece's first vertex
     counts:   [n, 2] int32, vertices and faces of each piece
+    concavity: largest left in a piece, as a share of the mesh's size
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     counts: np.ndarray
+    concavity: float = 1.0
 
     def __len__(self) -> int:
         return len(self.counts)
 
-    def __iter__(self):  # type: ignore[no-untyped-def]
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """(vertices [p, 3], faces [q, 3]) of each piece."""
         ends = np.cumsum(self.counts, axis=0)
         for (a, b), (n, m) in zip(ends, self.counts, strict=True):
             yield self.vertices[a - n : a], self.faces[b - m : b]
 
     def scaled(self, factor: float) -> ConvexPieces:
-        return ConvexPieces(self.vertices * np.float32(factor), self.faces, self.counts)
+        return replace(self, vertices=self.vertices * np.float32(factor))
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,8 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
     Mirtich 1996, "Fast and Accurate Computation of Polyhedral Mass Properties", J. Graphics Tools 1, as
     trimesh evaluates them. Raises MeshError for a mesh that is not closed or encloses nothing.
     """
+    import trimesh
+
     report = validate(vertices, faces)
     if not report.watertight or report.volume <= 0.0:
         raise MeshError(
@@ -159,13 +163,15 @@ def decompose(
     # Hulls anew: what CoACD returns may be flat or not closed where pieces are thin.
     ends = np.cumsum(counts)
     hulls = [_hull(points[end - n : end] * size + centre) for end, n in zip(ends, counts, strict=True)]
-    pieces = _joined([hull for hull in hulls if hull is not None])
+    pieces = replace(_joined([hull for hull in hulls if hull is not None]), concavity=float(threshold))
     logger.info("%d faces in %d convex pieces in %.1f s", len(f), len(pieces), time.monotonic() - started)
     return pieces
 
 
 def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """The convex hull's vertices and outward faces; None where it is flat."""
+    import trimesh
+
     try:
         hull = trimesh.convex.convex_hull(np.asarray(points, np.float32).astype(np.float64))
     except Exception:  # Qhull's own errors and trimesh's, for points in one plane

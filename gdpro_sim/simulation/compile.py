@@ -16,7 +16,9 @@ from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.colliders import MeshCollider, compile_collider
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
 from gdpro_sim.simulation.compile_mpm import compile_particles
+from gdpro_sim.simulation.compile_mujoco import compile_mujoco, prepare
 from gdpro_sim.simulation.model import Body, Ground, Model
+from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.placement import material_of, place
 from gdpro_sim.simulation.scene import Scene, SceneBody
 from gdpro_sim.simulation.solver_options import MpmOptions
@@ -35,6 +37,10 @@ def check_files(scene: Scene) -> None:
             if reference is not None and not scene.resolve(reference).exists():
                 path = scene.resolve(reference)
                 raise SceneError(f"{scene.name}: bodies[{body.name}].{key}: {path}: no such file")
+    if isinstance(scene.solver, MujocoOptions) and scene.solver.base is not None:
+        if not scene.resolve(scene.solver.base).is_file():
+            path = scene.resolve(scene.solver.base)
+            raise SceneError(f"{scene.name}: solver.base: {path}: no such file")
     for k, collider in enumerate(scene.colliders):
         if isinstance(collider, MeshCollider) and not scene.resolve(collider.file).exists():
             path = scene.resolve(collider.file)
@@ -54,7 +60,7 @@ def load_assets(
     """
     check_files(scene)
     tell = on_progress or (lambda phase: None)
-    particles = isinstance(scene.solver, MpmOptions)
+    fem = not isinstance(scene.solver, MpmOptions | MujocoOptions)
     assets: dict[str, Asset] = {}
     for body in scene.bodies:
         if stored and body.name in stored:
@@ -78,12 +84,14 @@ def load_assets(
                 color=body.color,
                 texture=None if body.texture is None else scene.resolve(body.texture),
                 up=body.up,
-                tets=not particles,
+                tets=fem,
                 target_tets=body.tets,
                 seed=scene.seed,
                 on_progress=tell,
             )
-        if asset.tets is None and not particles:
+        if isinstance(scene.solver, MujocoOptions):
+            asset = prepare(body, asset, tell)
+        if asset.tets is None and fem:
             # At the asset's own size: the caller may place several bodies of one asset at several sizes.
             asset = tetrahedralize_asset(asset, target_tets=body.tets, on_progress=tell)
         if asset.material is None or body.material is not None:
@@ -101,6 +109,8 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
     options = scene.solver
     if isinstance(options, MpmOptions):
         return compile_particles(scene, options, assets, device=device)
+    if isinstance(options, MujocoOptions):
+        return compile_mujoco(scene, options, assets, device=device)
     bodies: list[Body] = []
     columns: dict[str, list[np.ndarray]] = {
         key: []

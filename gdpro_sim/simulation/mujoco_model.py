@@ -131,18 +131,32 @@ class MujocoSettings:
 
 
 @dataclass(frozen=True)
+class Control:
+    """What an actuator is told: values [K] at times [K] s, linear in between, held before and after."""
+
+    actuator: str
+    times: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
 class MujocoWorld:
     """Everything of a `Model` that is MuJoCo's.
 
-    base: an MJCF file whose world the bodies join
+    base:     an MJCF file whose world the bodies join
+    keyframe: of the base, that it starts from; None: its own beginning
+    controls: of the base's actuators
     """
 
     bodies: tuple[RigidBody | SoftBody, ...] = ()
     settings: MujocoSettings = MujocoSettings()
     base: Path | None = None
+    keyframe: str | None = None
+    controls: tuple[Control, ...] = ()
 
 
 __all__ = [
+    "Control",
     "Joint",
     "JointKind",
     "MujocoSettings",

@@ -63,12 +63,19 @@ class Simulation:
 
 
 def solver_of(model: Model) -> Solver:
-    """The solver of a model: MPM where it has particles, else FEM. Raises SolverError."""
+    """The solver of a model: MPM where it has particles, MuJoCo where it has its bodies, else FEM.
+
+    Raises SceneError or SolverError.
+    """
     # Solvers are imported here: they compile kernels, which loading a scene should not.
     if model.particles is not None:
         from gdpro_sim.simulation.mpm import SolverMPM
 
         return SolverMPM(model)
+    if model.mujoco is not None:
+        from gdpro_sim.simulation.mujoco import SolverMuJoCo
+
+        return SolverMuJoCo(model)
     from gdpro_sim.simulation.fem import SolverFEM
 
     return SolverFEM(model)

@@ -25,6 +25,7 @@ from gdpro_sim.simulation.forces import (
     Spring,
     SurfacePressure,
 )
+from gdpro_sim.simulation.mujoco_options import MujocoBody, MujocoOptions
 from gdpro_sim.simulation.options import Options, Vector, several
 from gdpro_sim.simulation.regions import Region
 from gdpro_sim.simulation.solver_options import FemOptions, SolverOptions
@@ -91,6 +92,8 @@ class SceneBody(Options):
     forces: tuple[ConstantForce, ...] = Field(default=(), description="constant forces on parts of it")
     impulses: tuple[Push, ...] = Field(default=(), description="pushes at a time")
     pressures: tuple[SurfacePressure, ...] = Field(default=(), description="on parts of its surface")
+
+    mujoco: MujocoBody | None = Field(default=None, description="what it is to the MuJoCo solver")
 
     @field_validator("parts", "pins", "forces", "impulses", "pressures", mode="before")
     @classmethod
@@ -173,7 +176,9 @@ class Scene(Options):
     seed: int = Field(default=0, ge=0)
     camera: Camera = Field(default_factory=Camera)
     render: Render = Field(default_factory=Render)
-    solver: SolverOptions = Field(default_factory=FemOptions, description="FEM, or `kind: mpm`")
+    solver: SolverOptions = Field(
+        default_factory=FemOptions, description="FEM, `kind: mpm` or `kind: mujoco`"
+    )
     colliders: tuple[ColliderOptions, ...] = Field(
         default=(), description="rigid obstacles, at rest or moving; one or several"
     )
@@ -224,6 +229,12 @@ class Scene(Options):
 
     @model_validator(mode="after")
     def _pushed_in_time(self) -> Scene:
+        for body in self.bodies:
+            if body.mujoco is not None and not isinstance(self.solver, MujocoOptions):
+                raise ValueError(
+                    f"bodies[{body.name}].mujoco: belongs to `solver: {{kind: mujoco}}`, but the solver is "
+                    f"{self.solver.kind}"
+                )
         if isinstance(self.solver, FemOptions) and self.solver.integrator == "quasi-static":
             for body in self.bodies:
                 if body.impulses:
@@ -243,6 +254,8 @@ class Scene(Options):
         """References to every file the scene reads, as they are written in it."""
         named = [reference for body in self.bodies for reference in (body.asset, body.texture)]
         named += [collider.file for collider in self.colliders if isinstance(collider, MeshCollider)]
+        if isinstance(self.solver, MujocoOptions):
+            named.append(self.solver.base)
         return [reference for reference in named if reference]
 
     def resolve(self, reference: str) -> Path:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from gdpro_sim.simulation.model import FemSettings, Integrator, MpmSettings
+from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.options import Options, Vector
 
 
@@ -128,6 +129,6 @@ class MpmOptions(Options):
         return MpmSettings(**{**kept, "grid_spacing": grid_spacing})
 
 
-SolverOptions = Annotated[FemOptions | MpmOptions, Field(discriminator="kind")]
+SolverOptions = Annotated[FemOptions | MpmOptions | MujocoOptions, Field(discriminator="kind")]
 
 __all__ = ["FemOptions", "MpmOptions", "SolverOptions"]

@@ -88,16 +88,19 @@ class SolverMuJoCo:
     def reset(self) -> None:
         """Back to the model's initial state."""
         mujoco.mj_resetData(self.mjmodel, self.mjdata)
-        if self.mjmodel.nkey and self.model.mujoco is not None and self.model.mujoco.base is not None:
-            log.debug("keyframes of the base are left alone")
+        if self.world.start is not None:  # the base's joints and actuators come first
+            positions, velocities, controls = self.world.start
+            self.mjdata.qpos[: len(positions)] = positions
+            self.mjdata.qvel[: len(velocities)] = velocities
+            self.mjdata.ctrl[: len(controls)] = controls
         for body, name, points in zip(self.bodies, self.world.names, self.world.points, strict=True):
             if isinstance(body, RigidBody):
                 self._start_rigid(body, name)
             elif isinstance(body, SoftBody) and points is not None:
-                velocities = soft.velocities(body, points.positions)
+                moving = soft.velocities(body, points.positions)
                 for i in np.flatnonzero(~points.held).tolist():
                     address = self.mjmodel.body_dofadr[self.mjmodel.body(points.names[i]).id]
-                    self.mjdata.qvel[address : address + 3] = velocities[i]
+                    self.mjdata.qvel[address : address + 3] = moving[i]
         self._drive(0.0, 0.0)
         self._count = _Count()
         self._look()
@@ -263,6 +266,10 @@ class SolverMuJoCo:
                 spin = Rotation.from_matrix(rotation.T @ later @ collider.rotation).as_rotvec() / h
                 velocity = (later @ collider.position + moved - position) / h
                 self.mjdata.qvel[dof : dof + 6] = [*velocity, *spin]
+        assert self.model.mujoco is not None
+        for control in self.model.mujoco.controls:
+            value = np.interp(time, control.times, control.values)
+            self.mjdata.actuator(control.actuator).ctrl = value
         for body, name in zip(self.bodies, self.world.names, strict=True):
             if isinstance(body, SoftBody):
                 for k, motion in enumerate(body.motions):

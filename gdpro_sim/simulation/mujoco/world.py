@@ -36,6 +36,7 @@ class World:
     points:    of every soft body, None for a rigid one
     obstacles: of every collider of `Model.colliders`: the body that is moved, "" where it stands
     renamed:   (our name, the name taken), where the base had ours already
+    start:     (qpos, qvel, ctrl) of the base's keyframe that it starts from, or None
     """
 
     spec: mujoco.MjSpec
@@ -43,6 +44,7 @@ class World:
     points: tuple[soft.Points | None, ...]
     obstacles: tuple[str, ...]
     renamed: tuple[tuple[str, str], ...]
+    start: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 def build(model: Model) -> World:
@@ -50,7 +52,7 @@ def build(model: Model) -> World:
     world = model.mujoco
     if world is None:
         raise SceneError("the model has nothing for MuJoCo")
-    spec = _base(world)
+    spec, start = _base(world)
     taken = _names(spec)
     renamed: list[tuple[str, str]] = []
 
@@ -88,7 +90,7 @@ def build(model: Model) -> World:
     obstacles = []
     for collider in model.colliders:
         obstacles.append(_obstacle(spec, collider, name(collider.name), heavy, geoms))
-    return World(spec, tuple(names), tuple(points), tuple(obstacles), tuple(renamed))
+    return World(spec, tuple(names), tuple(points), tuple(obstacles), tuple(renamed), start)
 
 
 def compile_spec(spec: mujoco.MjSpec, where: str = "the scene") -> mujoco.MjModel:
@@ -99,20 +101,37 @@ def compile_spec(spec: mujoco.MjSpec, where: str = "the scene") -> mujoco.MjMode
         raise SceneError(f"{where}: MuJoCo cannot compile it: {' '.join(str(error).split())}") from None
 
 
-def _base(world: MujocoWorld) -> mujoco.MjSpec:
+def _base(world: MujocoWorld) -> tuple[mujoco.MjSpec, tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
+    """The spec of the base, without its keyframes, and the state of the one it starts from."""
     if world.base is None:
         spec = mujoco.MjSpec()
         spec.modelname = "gdpro"
-        return spec
+        return spec, None
     if not world.base.is_file():
         raise SceneError(f"{world.base}: no such file")
     try:
         spec = mujoco.MjSpec.from_file(str(world.base))
-        spec.copy().compile()
+        alone = spec.copy().compile()
     except (ValueError, mujoco.FatalError) as error:
         message = " ".join(str(error).split())
         raise SceneError(f"{world.base}: MuJoCo cannot compile it: {message}") from None
-    return spec
+    names = [key.name for key in spec.keys]
+    for key in list(spec.keys):  # they would have to name the joints of our bodies, too
+        spec.delete(key)
+    _check_known(f"{world.base}: keyframe", [world.keyframe] if world.keyframe else [], names)
+    actuators = [item.name for item in spec.actuators]
+    _check_known(f"{world.base}: actuator", [item.actuator for item in world.controls], actuators)
+    if world.keyframe is None:
+        return spec, None
+    k = names.index(world.keyframe)
+    return spec, (alone.key_qpos[k].copy(), alone.key_qvel[k].copy(), alone.key_ctrl[k].copy())
+
+
+def _check_known(what: str, wanted: list[str], names: list[str]) -> None:
+    for name in wanted:
+        if name not in names:
+            known = ", ".join(repr(item) for item in names if item) or "none with a name"
+            raise SceneError(f"{what} {name!r}: there is none; there are: {known}")
 
 
 def _names(spec: mujoco.MjSpec) -> set[str]:
