@@ -159,7 +159,7 @@ PRESETS: dict[str, dict[str, float | str]] = {
 
 
 LAW_FIELDS: dict[str, tuple[str, ...]] = {
-    "hardening": ("stvk_hencky",),
+    "hardening": LAWS,
     "bulk_modulus": ("fluid",),
     "viscosity": ("fluid", "herschel_bulkley"),
     "flow_index": ("herschel_bulkley",),
@@ -172,6 +172,18 @@ LAW_FIELDS: dict[str, tuple[str, ...]] = {
     "fracture_energy": LAWS,
 }
 """Fields that mean something for some laws alone."""
+
+
+def _kept(preset: dict[str, float | str], value: dict[str, Any]) -> dict[str, float | str]:
+    """What of a preset still means something beside what the user says."""
+    kept = dict(preset)
+    if "model" in value:
+        for name, laws in LAW_FIELDS.items():
+            if value["model"] not in laws:
+                kept.pop(name, None)
+    if "tensile_strength" in value and value["tensile_strength"] is None:
+        kept.pop("fracture_energy", None)
+    return kept
 
 
 class Material(BaseModel):
@@ -200,8 +212,8 @@ class Material(BaseModel):
     yield_stress: float | None = Field(
         default=None,
         gt=0.0,
-        description="von Mises stress at which it starts to flow, Pa; sqrt(3) times that in shear; default: "
-        "never",
+        description="von Mises stress at which it starts to flow, Pa: sqrt(3) times the shear stress; "
+        "default: never",
     )
     hardening: float = Field(default=0.0, ge=0.0, description="yield stress gained per plastic strain, Pa")
     tensile_strength: float | None = Field(
@@ -258,7 +270,7 @@ class Material(BaseModel):
                 near = difflib.get_close_matches(str(name), PRESETS, n=1)
                 hint = f" (did you mean {near[0]!r}?)" if near else ""
                 raise ValueError(f"unknown material {name!r}{hint}; presets: {', '.join(PRESETS)}")
-            value = {**PRESETS[name], **value}
+            value = {**_kept(PRESETS[name], value), **value}
         if isinstance(value, dict) and value.get("yield_stress") is not None:
             value = {"model": "stvk_hencky", **value}
         if isinstance(value, dict) and isinstance(value.get("bulk_modulus"), (int, float)):
@@ -287,7 +299,7 @@ class Material(BaseModel):
             if self.model not in laws and getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(
                     f"{name} means nothing for the law {self.model!r}; it is for {', '.join(laws)}: leave it "
-                    "out, or choose another model"
+                    "out, choose another model, or begin with no preset"
                 )
         needed: dict[str, tuple[str, ...]] = {
             "drucker_prager": ("friction_angle",),

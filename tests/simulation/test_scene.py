@@ -239,7 +239,8 @@ def test_presets_are_physical(name: str) -> None:
     material = Material.model_validate(name)
     assert material.preset == name
     lam, mu = material.lame
-    assert mu == pytest.approx(material.young / (2 * (1 + material.poisson)))
+    if material.model != "fluid":
+        assert mu == pytest.approx(material.young / (2 * (1 + material.poisson)))
     assert lam + 2 * mu / 3 == pytest.approx(
         material.young / (3 * (1 - 2 * material.poisson))
     )  # bulk modulus

@@ -85,7 +85,8 @@ def _laws(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for bad, problem in (
         (
             (law < 0) | (law >= len(LAWS)),
-            f"law must be a number below {len(LAWS)} of gdpro_sim.materials.LAWS",
+            f"law must be a number below {len(LAWS)} of gdpro_sim.materials.LAWS; what flows, MPM alone can "
+            "simulate",
         ),
         (~(limit > 0.0), "yield stress must be > 0 Pa (inf: elastic)"),
         (~(np.isfinite(hardening) & (hardening >= 0.0)), "hardening must be finite and >= 0 Pa"),
