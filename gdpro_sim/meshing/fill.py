@@ -12,6 +12,7 @@ most of the rays decide, and the field is worn down to where the Gaussians lie.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -221,6 +222,7 @@ def _grid(counts: np.ndarray) -> np.ndarray:
     return np.stack(axes, -1).reshape(-1, 3)
 
 
+@functools.lru_cache(maxsize=4)
 def blue_noise_tile(seed: int) -> np.ndarray:
     """TILE^3 points [TILE^3, 3] in [0, TILE)^3, none closer than TILE_RADIUS to another or to its periodic
     copies: darts thrown at random (Cook 1986), many at a time."""
@@ -233,7 +235,9 @@ def blue_noise_tile(seed: int) -> np.ndarray:
             distance, _ = cKDTree(points, boxsize=TILE).query(darts, distance_upper_bound=TILE_RADIUS)
             darts = darts[distance > TILE_RADIUS]
         points = np.concatenate([points, darts[_spread(darts, TILE_RADIUS, boxsize=TILE)]])
-    return points[:wanted]
+    points = points[:wanted]
+    points.flags.writeable = False
+    return points
 
 
 def _spread(points: np.ndarray, radius: float, boxsize: float | None = None) -> np.ndarray:
@@ -332,6 +336,9 @@ def _thin_parts(
     fresh[1:] = (np.diff(cell[order], axis=0) != 0).any(1)
     chosen = order[fresh]
     chosen = chosen[inside(middle[chosen], spacing)]
+    # Not those near an edge, deep under one wall but at another: walls opposite each other have better ones.
+    room = inside.distance(middle[chosen])
+    chosen = chosen[room > 0.125 * np.minimum(depth[chosen], spacing)]
     chosen = chosen[_spread(middle[chosen], APART * spacing)]
     return middle[chosen], np.minimum(2.0 * inside.distance(middle[chosen]) / spacing, 1.0)
 
