@@ -369,6 +369,37 @@ def fill(
         values_out[n] = four(v + weight * vector_at(target, n), mass)
 
 
+@wp.kernel
+def deficit(
+    start: int,
+    # In:
+    count: int,
+    ranges: int,
+    momentum: wp.array[wp.vec4],
+    values: wp.array[wp.vec4],
+    # Out:
+    deficit_out: wp.array[wp.vec3d],
+):
+    """Momentum that the nodes should have and have not, kg m/s."""
+    i = start + wp.tid()
+    bounds = block_range(count, ranges, i)
+    total = wp.vec3d()
+    for n in range(bounds[0], bounds[1]):
+        missing = vector_at(momentum, n) - vector_at(values, n)
+        total += wp.float64(momentum[n][3]) * wp.vec3d(
+            wp.float64(missing[0]), wp.float64(missing[1]), wp.float64(missing[2])
+        )
+    deficit_out[i] = total
+
+
+@wp.kernel
+def shift(start: int, v: wp.vec3, values_out: wp.array[wp.vec4]):
+    """Adds v to the velocity of nodes that have mass."""
+    n = start + wp.tid()
+    if values_out[n][3] > 0.0:
+        values_out[n] = four(vector_at(values_out, n) + v, values_out[n][3])
+
+
 # ---- boundaries ----
 
 

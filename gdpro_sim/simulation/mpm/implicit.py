@@ -30,7 +30,7 @@ ROUNDING = 2.0**-23
 """Of float32, relative."""
 
 SETTLED = 4.0
-"""Multiple of `newton_tolerance` that the last look at the boundaries may have changed a velocity by."""
+"""Multiple of `newton_tolerance` that does where boundaries are about: friction settles slowly."""
 
 
 class Outcome(NamedTuple):
@@ -73,6 +73,7 @@ class GridNewton:
         self.work = wp.zeros((int(mpm_implicit.WORK), stride), dtype=float, device=device)
         self._energies = wp.zeros(len(particles), dtype=wp.float64, device=device)
         self._sums, self._more_sums = (wp.zeros(RANGES, dtype=wp.float64, device=device) for _ in range(2))
+        self._deficits = wp.zeros(RANGES, dtype=wp.vec3d, device=device)
         self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
         self._tolerance = wp.full(1, settings.cg_tolerance, dtype=wp.float64, device=device)
         self._projectors = wp.zeros(0, dtype=wp.mat33, device=device)
@@ -116,12 +117,15 @@ class GridNewton:
         speed = self._measure(self._momentum)[1]
         scale = max(speed, math.hypot(*change), 1e-6)
         energy = self._choose_start(h, change, scale)
-        self._iterations, residual, done, following = 0, math.inf, 0, bool(self.boundaries)
+        tolerance = settings.newton_tolerance * (SETTLED if self.boundaries else 1.0)
+        self._iterations, residual, done, settled = 0, math.inf, 0, False
         while done < settings.newton_iterations and math.isfinite(energy):
             self.linearise(h)
             jump = 0.0
-            if following:
+            if self.boundaries:
                 jump = self._meet_boundaries(h, scale)
+                if settled and jump <= tolerance:
+                    return Outcome(True, True, max(residual, jump), done, self._iterations)
                 energy = self.energy(h)
                 if not math.isfinite(energy):
                     break
@@ -136,14 +140,26 @@ class GridNewton:
                 energy = math.inf
                 break
             length, energy = self._line_search(h, energy, slope, self._noise(h, energy, speed))
-            if length == 0.0:
+            # Rounding may keep the energy of a very short step from falling: it counts as taken.
+            settled = solved and residual <= tolerance
+            if settled and not self.boundaries:
+                self._balance()
+                return Outcome(True, True, residual, done, self._iterations)
+            if length == 0.0 and not settled:
                 break
-            if solved and length == 1.0:
-                if residual <= settings.newton_tolerance:
-                    return Outcome(True, True, residual, done, self._iterations)
-                # The last iterations descend on one fixed energy.
-                following &= residual > SETTLED * settings.newton_tolerance
         return Outcome(False, math.isfinite(energy), residual, done, self._iterations)
+
+    def _balance(self) -> None:
+        """Give all nodes the velocity that conjugate gradients, which stop early, have left out."""
+        self.grid.launch(
+            mpm_newton.deficit,
+            RANGES,
+            [64 * self.grid.count, RANGES, self._momentum, self.grid.values],
+            [self._deficits],
+            minimum=8,
+        )
+        left = self._deficits.numpy().sum(axis=0) / self._mass
+        self._over_nodes(mpm_newton.shift, [wp.vec3(*left)], [self.grid.values])
 
     def _noise(self, h: float, energy: float, speed: float) -> float:
         """J that rounding of the velocities may make of an energy."""
