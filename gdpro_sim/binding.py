@@ -124,10 +124,10 @@ class BoundGaussians:
         Vertices that coincide at rest, along cuts of the mesh, count as one: cuts do not show while closed.
         """
         v = self.vertices if vertices is None else vertices.to(self.device)
-        return surface_normals(v, self.faces, self.face_ids, self.barycentrics, self._welded)
+        return surface_normals(v, self.faces, self.face_ids, self.barycentrics, self.welded)
 
     @functools.cached_property
-    def _welded(self) -> torch.Tensor | None:
+    def welded(self) -> torch.Tensor | None:
         """One vertex for each, [V] int64, the same for those that coincide at rest; None where none do."""
         rows = np.ascontiguousarray(self.vertices.detach().cpu().numpy()).view(np.dtype((np.void, 12)))
         _, first, inverse = np.unique(rows.ravel(), return_index=True, return_inverse=True)

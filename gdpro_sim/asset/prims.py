@@ -215,6 +215,7 @@ def define_mesh(
     faces: np.ndarray,
     colors: np.ndarray | None,
     average_color: np.ndarray,
+    welded: torch.Tensor | None = None,
 ) -> Usd.Prim:
     """A triangle mesh; `colors` [V, 3] sRGB per vertex, or `average_color` [3] where there are none."""
     mesh = UsdGeom.Mesh.Define(stage, parent.AppendChild("Mesh"))
@@ -228,14 +229,21 @@ def define_mesh(
     prim = mesh.GetPrim()
     if colors is not None:
         set_custom(prim, "gdpro:vertexColors", T.Float3Array, vec3f(colors))
-    set_mesh(prim, vertices, faces)
+    set_mesh(prim, vertices, faces, welded=welded)
     return prim
 
 
-def set_mesh(prim: Usd.Prim, vertices: np.ndarray, faces: np.ndarray, time: Time = DEFAULT) -> None:
-    """Author a mesh's points, normals and extent at `time`."""
+def set_mesh(
+    prim: Usd.Prim,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    time: Time = DEFAULT,
+    *,
+    welded: torch.Tensor | None = None,
+) -> None:
+    """Author a mesh's points, normals and extent at `time`; `welded` as in `BoundGaussians.welded`."""
     prim.GetAttribute("points").Set(vec3f(vertices), time)
-    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces))
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces), welded)
     prim.GetAttribute("normals").Set(vec3f(to_numpy(normals)), time)
     prim.GetAttribute("extent").Set(bounds(vertices), time)
 

@@ -76,7 +76,7 @@ class Look:
         positions: np.ndarray,
         *,
         patches: np.ndarray | None = None,
-        stretch: float = 4.0,
+        stretch: float = 3.0,
         anisotropy: float = 2.5,
         device: str = "cpu",
     ) -> None:
