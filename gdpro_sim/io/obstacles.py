@@ -36,27 +36,33 @@ class Obstacles:
         self, colliders: Sequence[Collider], low: np.ndarray, high: np.ndarray, device: str = "cpu"
     ) -> None:
         low, high = np.asarray(low, float), np.asarray(high, float)
-        self._items: list[tuple[Collider, BoundGaussians]] = []
-        for collider in colliders:
+        self._items: list[tuple[int, Collider, BoundGaussians]] = []
+        for number, collider in enumerate(colliders):
             if not collider.visible:
                 continue
             vertices, faces = _surface(collider, low, high)
             placed = vertices @ collider.rotation.T + collider.position
             mesh = SurfaceMesh.from_arrays(placed, faces, color=COLOR)
             bound = bind_mesh(mesh, budget=max(BUDGET, 2 * len(faces)), occlusion=0.0).to(device)
-            self._items.append((collider, bound))
+            self._items.append((number, collider, bound))
 
     def added_to(
-        self, gaussians: Gaussians, normals: torch.Tensor, time: float
+        self, gaussians: Gaussians, normals: torch.Tensor, time: float, poses: np.ndarray | None = None
     ) -> tuple[Gaussians, torch.Tensor]:
-        """`gaussians` and their normals [N, 3], joined with those of the obstacles at a time in s."""
+        """`gaussians` and their normals [N, 3], joined with those of the obstacles at a time in s.
+
+        poses: `gdpro_sim.simulation.frame.Frame.colliders`, where some move freely
+        """
         parts, facing = [gaussians], [normals]
-        for collider, bound in self._items:
+        for number, collider, bound in self._items:
             vertices = bound.vertices
-            if collider.motion is not None:
-                rotation, shift = (
-                    torch.from_numpy(part).to(vertices) for part in pose_at(collider.motion, time)
-                )
+            pose = None
+            if poses is not None:
+                pose = poses[number, :, :3], poses[number, :, 3]
+            elif collider.motion is not None:
+                pose = pose_at(collider.motion, time)
+            if pose is not None:
+                rotation, shift = (torch.tensor(part).to(vertices) for part in pose)
                 vertices = vertices @ rotation.T + shift
             parts.append(bound.gaussians(vertices))
             facing.append(bound.normals(vertices))

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
 import gdpro_sim
@@ -25,6 +24,7 @@ from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import RequestError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
+from gdpro_sim.io.facing import Facing
 from gdpro_sim.io.images import (
     frame_name,
     read_png,
@@ -39,7 +39,6 @@ from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.io.resume import Store, StoredFrame
 from gdpro_sim.io.usd import SimulationWriter, body_records
 from gdpro_sim.simulation.compile import check_files, load_assets
-from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.model import Diagnostics
 from gdpro_sim.simulation.placement import material_of
 from gdpro_sim.simulation.run import Simulation
@@ -184,6 +183,7 @@ def _run(
     total = len(simulation)
     explicit = simulation.model.particles is not None and simulation.model.mpm.integrator == "explicit"
     rows: list[dict[str, Any]] = []
+    facing = Facing([body.gaussians for body in simulation.model.bodies], renderer.cameras[0])
     report("simulate", 0, total)
     simulation.solver.reset()
     scene = simulation.scene
@@ -203,49 +203,44 @@ def _run(
             stored = store.load(index)
             if stored is None:
                 simulation.advance(index)
-                surfaces, diagnostics = simulation.surfaces(), simulation.solver.diagnostics()
-                solved = simulation.milliseconds["solve"]
+                done = StoredFrame(
+                    simulation.surfaces(),
+                    simulation.solver.diagnostics(),
+                    simulation.milliseconds["solve"],
+                    simulation.colliders(),
+                )
             else:
-                surfaces, diagnostics, solved = stored.surfaces, stored.diagnostics, stored.solve
+                done = stored
                 if index == store.resumed - 1:
                     simulation.solver.load_state_dict(store.state())
-            frame = simulation.frame(index, surfaces, diagnostics)
+            frame = simulation.frame(index, done.surfaces, done.diagnostics, done.colliders)
 
             begin = time.perf_counter()
             path = folder / "frames" / frame_name(index)
             picture = None
             if stored is None or not path.exists():
-                shown = obstacles.added_to(frame.gaussians(), _normals(simulation, frame), frame.time)
+                normals = facing.normals(done.surfaces)
+                shown = obstacles.added_to(frame.gaussians(), normals, frame.time, frame.colliders)
                 picture = renderer.render(*shown)
             drawn = time.perf_counter()
             if picture is not None:
                 write_png(path, picture)
             writer.add(frame)
             if stored is None:
-                done = StoredFrame(surfaces, diagnostics, solved)
                 store.save(index, done, simulation.solver.state_dict())
             written = time.perf_counter()
             milliseconds = {
-                "solve": solved,
+                "solve": done.solve,
                 "resplat": simulation.milliseconds["resplat"],
                 "render": 1e3 * (drawn - begin),
                 "write": 1e3 * (written - drawn),
             }
-            rows.append(_row(index, diagnostics, milliseconds, IMPLICIT if explicit else ()))
+            rows.append(_row(index, done.diagnostics, milliseconds, IMPLICIT if explicit else ()))
             report("simulate", index + 1, total)
         report("usd", 0, 0)
         begin = time.perf_counter()
     rows[-1]["ms_write"] += 1e3 * (time.perf_counter() - begin)
     return rows
-
-
-def _normals(simulation: Simulation, frame: Frame) -> torch.Tensor:
-    return torch.cat(
-        [
-            body.gaussians.normals(torch.from_numpy(moved.vertices))
-            for body, moved in zip(simulation.model.bodies, frame.bodies, strict=True)
-        ]
-    )
 
 
 def _read_all(pictures: list[Path], report: Progress) -> Iterator[np.ndarray]:

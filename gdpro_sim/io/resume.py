@@ -34,11 +34,13 @@ class StoredFrame:
 
     surfaces: [V, 3] float32 m of each body
     solve:    milliseconds it took
+    colliders: as in `gdpro_sim.simulation.frame.Frame`
     """
 
     surfaces: list[np.ndarray]
     diagnostics: Diagnostics
     solve: float
+    colliders: np.ndarray | None = None
 
 
 class Store:
@@ -122,7 +124,7 @@ class Store:
             k: tuple(v) if isinstance(v, list) else v for k, v in figures["diagnostics"].items()
         }
         surfaces = [data[f"surface.{k}"] for k in range(sum(n.startswith("surface.") for n in data))]
-        return StoredFrame(surfaces, Diagnostics(**diagnostics), figures["solve"])
+        return StoredFrame(surfaces, Diagnostics(**diagnostics), figures["solve"], data.get("colliders"))
 
     def state(self) -> State:
         """The solver's state after the last of the `resumed` frames."""
@@ -132,6 +134,8 @@ class Store:
         figures = json.dumps({"diagnostics": asdict(frame.diagnostics), "solve": frame.solve})
         surfaces = {f"surface.{k}": s for k, s in enumerate(frame.surfaces)}
         _write(self._state_file(index), state)
+        if frame.colliders is not None:
+            surfaces["colliders"] = frame.colliders
         _write(self._frame(index), {"figures": np.array(figures), **surfaces})
         size = sum(array.nbytes for array in state.values())
         # The last two at least: a file may be cut off when a machine goes down.

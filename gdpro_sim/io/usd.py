@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Any, get_args
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 
 from gdpro_sim.asset import Asset, prims, stage
 from gdpro_sim.asset.prims import Precision, SplatPrims, SplatSample
@@ -130,6 +130,7 @@ class SimulationWriter:
         self._metadata = json.dumps(metadata or {}, allow_nan=False)
         self._prims: list[tuple[Usd.Prim, SplatPrims]] = []
         self._faces = [prims.to_numpy(body.gaussians.faces) for body in bodies]
+        self._welded = [body.gaussians.to("cpu").welded for body in bodies]
         self._first = self._last = 0
         self._pending = 0
         self._open = True
@@ -196,6 +197,8 @@ class SimulationWriter:
         stage.set_custom(root, "gdpro:metadata", prims.T.String, self._metadata)
         stage.set_custom(root, "gdpro:precision", prims.T.String, self._precision)
         root.CreateAttribute("gdpro:time", prims.T.Double, True)
+        if frame.colliders is not None:
+            root.CreateAttribute("gdpro:colliders", prims.T.DoubleArray, True)
         for figure in fields(Diagnostics):
             root.CreateAttribute(_FIGURES + figure.name, _FIGURE_TYPES[str(figure.type)][0], True)
         taken: set[str] = set()
@@ -225,7 +228,13 @@ class SimulationWriter:
         bound = record.gaussians
         average = prims.to_numpy(sh_to_rgb(bound.sh[:, 0])).mean(0, dtype=np.float64)
         mesh = prims.define_mesh(
-            self._stage, path, body.vertices, prims.to_numpy(bound.faces), record.vertex_colors, average
+            self._stage,
+            path,
+            body.vertices,
+            prims.to_numpy(bound.faces),
+            record.vertex_colors,
+            average,
+            bound.to("cpu").welded,
         )
         splats = SplatPrims.define(self._stage, path, body.gaussians, sample, self._precision)
         prims.write_binding(mesh, splats.splats, bound)
@@ -249,15 +258,17 @@ class SimulationWriter:
         code = Usd.TimeCode(float(frame.index))
         root = self._stage.GetDefaultPrim()
         root.GetAttribute("gdpro:time").Set(float(frame.time), code)
+        if frame.colliders is not None:
+            root.GetAttribute("gdpro:colliders").Set(Vt.DoubleArray.FromNumpy(frame.colliders.ravel()), code)
         for figure in fields(Diagnostics):
             to_usd = _FIGURE_TYPES[str(figure.type)][1]
             root.GetAttribute(_FIGURES + figure.name).Set(
                 to_usd(getattr(frame.diagnostics, figure.name)), code
             )
-        for body, sample, faces, (mesh, splats) in zip(
-            frame.bodies, samples, self._faces, self._prims, strict=True
+        for body, sample, faces, welded, (mesh, splats) in zip(
+            frame.bodies, samples, self._faces, self._welded, self._prims, strict=True
         ):
-            prims.set_mesh(mesh, body.vertices, faces, code)
+            prims.set_mesh(mesh, body.vertices, faces, code, welded=welded)
             splats.set(sample, code)
 
     # ---- ending ----
@@ -429,7 +440,9 @@ class SimulationReader:
                 if value is None:  # written before there was such a figure
                     continue
                 figures[figure.name] = _FIGURE_TYPES[str(figure.type)][2](value)
-        return Frame(int(code), self.times[index], bodies, Diagnostics(**figures))
+            poses = self._root.GetAttribute("gdpro:colliders").Get(code)
+        colliders = None if poses is None else np.array(poses).reshape(-1, 3, 4)
+        return Frame(int(code), self.times[index], bodies, Diagnostics(**figures), colliders)
 
     def _vertices(self, path: Sdf.Path, code: float) -> np.ndarray:
         return prims.read(self._child(path, "Mesh"), "points", np.float32, (-1, 3), code)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from gdpro_sim.asset import Asset, kind
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.files import prepare_folder, remove_stale
 from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.io.facing import Facing
 from gdpro_sim.io.images import frame_name, remove_frames_from, write_png
 from gdpro_sim.io.obstacles import Obstacles
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
@@ -74,12 +74,10 @@ def render_file(
     reader = SimulationReader(path)
     renderer = _recorded(reader, camera or {}, shading, background)
     obstacles = _obstacles(reader, name)
-    bodies = [body.gaussians.to(name) for body in reader.bodies]
+    facing = Facing([body.gaussians.to(name) for body in reader.bodies], renderer.cameras[0])
     for frame in reader:
-        normals = torch.cat(
-            [b.normals(torch.from_numpy(f.vertices)) for b, f in zip(bodies, frame.bodies, strict=True)]
-        )
-        shown = obstacles.added_to(frame.gaussians().to(name), normals, frame.time)
+        normals = facing.normals([body.vertices for body in frame.bodies])
+        shown = obstacles.added_to(frame.gaussians().to(name), normals, frame.time, frame.colliders)
         write(renderer.render(*shown), len(reader))
     remove_frames_from(folder, len(reader))
     return written

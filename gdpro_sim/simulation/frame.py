@@ -29,12 +29,15 @@ class Frame:
 
     index: frame number from 0; time code of the USD samples
     time:  seconds since the start
+    colliders: [C, 3, 4] float64, rotation and shift m of each of the scene's colliders since the start; None
+           where all of them are where their keyframes have them
     """
 
     index: int
     time: float
     bodies: tuple[BodyFrame, ...]
     diagnostics: Diagnostics
+    colliders: np.ndarray | None = None
 
     def gaussians(self) -> Gaussians:
         """Every body's Gaussians joined, in body order."""

@@ -38,7 +38,7 @@ class Simulation:
         self.solver.reset()
         for index in range(len(self)):
             self.advance(index)
-            yield self.frame(index, self.surfaces(), self.solver.diagnostics())
+            yield self.frame(index, self.surfaces(), self.solver.diagnostics(), self.colliders())
 
     def advance(self, index: int) -> None:
         """Bring the solver from frame `index - 1` to frame `index`; frame 0 is the initial state."""
@@ -51,7 +51,24 @@ class Simulation:
         """Deformed surface vertices of every body, [V, 3] float32 m."""
         return [self.solver.surface_positions(i) for i in range(len(self.model.bodies))]
 
-    def frame(self, index: int, surfaces: list[np.ndarray], diagnostics: Diagnostics) -> Frame:
+    def colliders(self) -> np.ndarray | None:
+        """Where colliders are that move freely, see `Frame.colliders`."""
+        if self.model.particles is None or all(item.mass is None for item in self.model.colliders):
+            return None
+        from gdpro_sim.simulation.mpm import SolverMPM
+        from gdpro_sim.simulation.mpm.boundaries import collider_poses
+
+        assert isinstance(self.solver, SolverMPM)
+        poses = collider_poses(self.solver.boundaries, self.model, self.solver.time)
+        return np.stack([np.column_stack(pose) for pose in poses])
+
+    def frame(
+        self,
+        index: int,
+        surfaces: list[np.ndarray],
+        diagnostics: Diagnostics,
+        colliders: np.ndarray | None = None,
+    ) -> Frame:
         """Re-splat: the Gaussians of every body carried by its surface."""
         begin = time.perf_counter()
         bodies = tuple(
@@ -59,7 +76,7 @@ class Simulation:
             for body, surface in zip(self.model.bodies, surfaces, strict=True)
         )
         self.milliseconds["resplat"] = 1e3 * (time.perf_counter() - begin)
-        return Frame(index, index / self.scene.fps, bodies, diagnostics)
+        return Frame(index, index / self.scene.fps, bodies, diagnostics, colliders)
 
 
 def solver_of(model: Model) -> Solver:

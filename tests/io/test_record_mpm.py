@@ -26,7 +26,9 @@ bodies:
     angular_velocity: [0, 2, 0]
     material: {preset: jelly, rayleigh_stiffness: 1.0e-4}
     pins: {side: top, fraction: 0.2, release: 0.03}
-colliders: {kind: box, size: [0.1, 0.1, 0.1], position: [0.3, 0, 0.05]}
+colliders:
+  - {kind: box, size: [0.1, 0.1, 0.1], position: [0.3, 0, 0.05]}
+  - {kind: sphere, radius: 0.04, position: [0, 0.2, 0.3], mass: 0.5, velocity: [0, -1, 0]}
 fps: 100
 duration: 0.06
 camera: {width: 96, height: 64}
@@ -62,6 +64,10 @@ def test_everything_is_written_and_read_back(straight: Recording, folder: Path) 
     assert first.bodies[0].vertices.max() == pytest.approx(0.21, abs=1e-3)
     assert last.bodies[1].vertices[:, 2].min() < first.bodies[1].vertices[:, 2].min()
     assert all(np.isfinite(body.vertices).all() for body in last.bodies)
+    assert last.colliders is not None and last.colliders.shape == (2, 3, 4)
+    np.testing.assert_array_equal(last.colliders[0], np.eye(3, 4))
+    fallen = 0.5 * 9.81 * last.time**2
+    np.testing.assert_allclose(last.colliders[1, :, 3], [0, -last.time, -fallen], rtol=0.02, atol=1e-4)
     facts = describe(straight.simulation)
     assert facts["bodies"]["sand"]["gaussians"] == len(sand.gaussians)
     again = render_file(straight.simulation, folder / "again", device="cpu")

@@ -1,0 +1,44 @@
+"""Which way the Gaussians of bodies face in a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from gdpro_sim.binding import BoundGaussians
+from gdpro_sim.cameras import Cameras
+
+
+class Facing:
+    """Normals of bodies seen by one camera.
+
+    Where no two triangles share a vertex the surface has come apart, or never was one: its pieces have no
+    inside, and are lit on the side that is seen.
+    """
+
+    def __init__(self, bodies: Sequence[BoundGaussians], cameras: Cameras) -> None:
+        self._bodies = [(bound, _loose(bound)) for bound in bodies]
+        self._eye = cameras.positions[0]
+
+    def normals(self, vertices: Sequence[np.ndarray]) -> torch.Tensor:
+        """[N, 3] unit, of the Gaussians of all bodies, carried by their `vertices` [V, 3] m."""
+        found = []
+        for (bound, loose), moved in zip(self._bodies, vertices, strict=True):
+            normals = bound.normals(torch.from_numpy(moved))
+            if loose:
+                corners = torch.from_numpy(moved).to(normals)[bound.faces.long()[bound.face_ids.long()]]
+                towards = self._eye.to(normals) - corners.mean(dim=1)
+                away = (normals * towards).sum(dim=1, keepdim=True) < 0.0
+                normals = torch.where(away, -normals, normals)
+            found.append(normals)
+        return torch.cat(found)
+
+
+def _loose(bound: BoundGaussians) -> bool:
+    faces = bound.faces.cpu().numpy()
+    return len(np.unique(faces)) == faces.size
+
+
+__all__ = ["Facing"]
