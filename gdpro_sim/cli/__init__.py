@@ -11,7 +11,7 @@ import typer
 from typer.exceptions import TyperException
 
 import gdpro_sim
-from gdpro_sim.cli import experiments, files, generation, verify  # noqa: F401  (they declare their commands)
+from gdpro_sim.cli import experiments, files, generation, mjcf, verify  # noqa: F401  (they declare their commands)
 from gdpro_sim.cli.common import app
 from gdpro_sim.errors import GdproError
 

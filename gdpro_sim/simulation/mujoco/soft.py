@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, set_contact
@@ -16,6 +17,9 @@ from gdpro_sim.simulation.mujoco_model import SoftBody
 LEAST_NODE = 1e-3
 """A node of a grid has at least this share of the mean node's mass: the body may not reach it."""
 
+LIGHT = 0.3
+"""A node of less than this share of the mean goes with another: it would flutter."""
+
 HELD = 0.5
 """A node is held where pinned vertices make up this share of what it carries."""
 
@@ -24,14 +28,12 @@ HELD = 0.5
 class Points:
     """What moves of a flex: vertices, or nodes of a grid.
 
-    positions: [n, 3] m; masses: [n] kg; held: [n] bool; driver: [n] number of the motion that moves it, or -1
-    names:     of their bodies, empty for what is held by the world
+    positions: [n, 3] m; masses: [n] kg
+    names:     of their bodies, empty for what is held, or goes with another
     """
 
     positions: np.ndarray
     masses: np.ndarray
-    held: np.ndarray
-    driver: np.ndarray
     names: tuple[str, ...]
 
 
@@ -42,15 +44,18 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
     for k, motion in enumerate(body.motions):
         driver[motion.vertices] = k
     positions, masses = body.vertices, body.masses
+    leader = np.arange(len(positions))
     if body.reduction != "full":
         positions, weights = grid(body)
         masses, held, driver = _of_nodes(body, weights, held, driver)
+        leader = _leaders(body, positions, masses, held)
+        masses = np.bincount(leader, weights=masses, minlength=len(masses))
     for k in range(len(body.motions)):
         mover = spec.worldbody.add_body(name=f"{name}_pin{k}", mocap=True)
         mover.explicitinertial = True
     names = [""] * len(positions)
     least = 1e-12
-    for i in np.flatnonzero(~held).tolist():
+    for i in np.flatnonzero(~held & (leader == np.arange(len(positions)))).tolist():
         names[i] = f"{name}_{i}"
         point = spec.worldbody.add_body(name=names[i], pos=positions[i].tolist())
         point.explicitinertial, point.mass = True, max(float(masses[i]), least)
@@ -60,19 +65,21 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
             item.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             item.armature, item.damping, item.frictionloss = 0.0, [0.0] * 3, 0.0
     owners = [
-        names[i] or (f"{name}_pin{driver[i]}" if driver[i] >= 0 else "world") for i in range(len(positions))
+        names[leader[i]] or (f"{name}_pin{driver[i]}" if driver[i] >= 0 else "world")
+        for i in range(len(positions))
     ]
+    local = np.where(held[:, None], positions, positions - positions[leader])
     flex = spec.add_flex(name=name, dim=3)
     flex.elem = body.tets.ravel().tolist()
     if body.reduction == "full":
         flex.vertbody = owners
         if held.any():
-            flex.vert = np.where(held[:, None], positions, 0.0).ravel().tolist()
+            flex.vert = local.ravel().tolist()
     else:
         flex.order = 1 if body.reduction == "trilinear" else 2
         flex.cellcount = list(body.cells)
         flex.nodebody = owners
-        flex.node = np.where(held[:, None], positions, 0.0).ravel().tolist()
+        flex.node = local.ravel().tolist()
         flex.vertbody = ["world"] * len(body.vertices)
         flex.vert = body.vertices.ravel().tolist()
     flex.young, flex.poisson, flex.damping = body.young, body.poisson, body.damping
@@ -82,7 +89,7 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
         mujoco.mjtFlexSelf.mjFLEXSELF_AUTO if body.self_contact else mujoco.mjtFlexSelf.mjFLEXSELF_NONE
     )
     set_contact(flex, body.friction, FLEX_REFERENCE)
-    return Points(positions, masses, held, driver, tuple(names))
+    return Points(positions, masses, tuple(names))
 
 
 def grid(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
@@ -104,6 +111,31 @@ def grid(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
             weights[rows, order * cell + k] += value
         each.append(weights)
     return nodes, np.einsum("pi,pj,pk->pijk", *each).reshape(len(body.vertices), -1)
+
+
+def _leaders(body: SoftBody, positions: np.ndarray, masses: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """[n] the node that each goes with: itself, or the nearest free one where the body does not reach it.
+
+    MuJoCo lets nothing move by itself that has no elasticity.
+    """
+    free = ~held & _reached(body) & (masses > LIGHT * masses.mean())
+    leader = np.arange(len(positions))
+    loose = ~held & ~free
+    if loose.any() and free.any():
+        leader[loose] = np.flatnonzero(free)[cKDTree(positions[free]).query(positions[loose])[1]]
+    return leader
+
+
+def _reached(body: SoftBody) -> np.ndarray:
+    """Nodes [n] bool of cells that hold the middle of a tet."""
+    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    cells, order = np.asarray(body.cells), 1 if body.reduction == "trilinear" else 2
+    middles = body.vertices[body.tets].mean(axis=1)
+    at = np.clip(((middles - low) / (high - low) * cells).astype(int), 0, cells - 1)
+    found = np.zeros(order * cells + 1, bool)
+    for i, j, k in np.unique(at, axis=0) * order:
+        found[i : i + order + 1, j : j + order + 1, k : k + order + 1] = True
+    return found.ravel()
 
 
 def _of_nodes(

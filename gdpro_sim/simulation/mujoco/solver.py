@@ -53,6 +53,7 @@ class SolverMuJoCo:
 
     mjmodel, mjdata: MuJoCo's own; actuators of a base may be driven through `mjdata.ctrl` between steps
     renamed:         (our name, the name taken) of bodies whose names a base had already
+    counted:         [nbody] bool, bodies that diagnostics count: not the obstacles that are moved
 
     Raises SceneError for a scene that MuJoCo cannot compile.
     """
@@ -79,7 +80,7 @@ class SolverMuJoCo:
             if name
         ]
         movers = {self.mjmodel.body(name).id for name in self.world.obstacles if name}
-        self._counted = np.array([i not in movers for i in range(self.mjmodel.nbody)])
+        self.counted = np.array([i not in movers for i in range(self.mjmodel.nbody)])
         self._count = _Count()
         self.reset()
 
@@ -98,7 +99,7 @@ class SolverMuJoCo:
                 self._start_rigid(body, name)
             elif isinstance(body, SoftBody) and points is not None:
                 moving = soft.velocities(body, points.positions)
-                for i in np.flatnonzero(~points.held).tolist():
+                for i in (k for k, own in enumerate(points.names) if own):
                     address = self.mjmodel.body_dofadr[self.mjmodel.body(points.names[i]).id]
                     self.mjdata.qvel[address : address + 3] = moving[i]
         self._drive(0.0, 0.0)
@@ -170,7 +171,7 @@ class SolverMuJoCo:
     def diagnostics(self) -> Diagnostics:
         """Energies in J, momenta about the world's origin, contacts; obstacles and pins do not count."""
         model, data = self.mjmodel, self._view
-        counted = self._counted
+        counted = self.counted
         mass = model.body_mass[counted]
         positions, linear, angular, inertia = self._motion(counted)
         spin = np.einsum("bij,bj->bi", inertia, angular)
