@@ -158,6 +158,22 @@ def block_of_particles(
     block_out[i] = number
 
 
+@wp.func_native("""
+#if !defined(__CUDACC__)
+    const int count = (int)order.shape[0];
+    const int* const __restrict from = order.data;
+    const float* const __restrict in = particles.data + (size_t)row * particles.shape[1];
+    float* const __restrict out = particles_out.data + (size_t)row * particles.shape[1];
+    for (int i = 0; i < count; ++i) out[i] = in[from[i]];
+#endif
+""")
+def permute_row(
+    row: int, order: wp.array[int], particles: wp.array2d[float], particles_out: wp.array2d[float]
+):
+    """One row with number order[i] at place i."""
+    ...
+
+
 @wp.kernel
 def permute_rows(
     start: int,
@@ -167,10 +183,8 @@ def permute_rows(
     # Out:
     particles_out: wp.array2d[float],
 ):
-    """Each row with number order[i] at place i."""
-    r = start + wp.tid()
-    for i in range(order.shape[0]):
-        particles_out[r, i] = particles[r, order[i]]
+    """Each row with number order[i] at place i. CPU."""
+    permute_row(start + wp.tid(), order, particles, particles_out)
 
 
 @wp.kernel

@@ -11,7 +11,7 @@ import warp as wp
 from gdpro_sim.device import Launches
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import mpm_grid, mpm_transfer
-from gdpro_sim.kernels.particles import POSITION
+from gdpro_sim.kernels.particles import POSITION, SPEED
 
 OFFSETS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(27, 3)
 """Of the blocks beside a block, in the order of `gdpro_sim.kernels.mpm_transfer`."""
@@ -71,6 +71,7 @@ class Grid:
         self._keys: wp.array = wp.zeros(count, dtype=int, device=device)
         self.owners: wp.array = wp.zeros(count, dtype=int, device=device)
         self.count = self.occupied = 0
+        self._seen: tuple[np.ndarray, np.ndarray] | None = None
         self.put(particles)
         self._room: dict[str, wp.array] = {}
         self.change: wp.array | None = None
@@ -183,6 +184,7 @@ class Grid:
         if self.device == "cpu":
             self.tiles = self.array("tiles", self.occupied * mpm_transfer.tile_nodes(self.width), wp.vec4)
         self.strayed.zero_()
+        self._seen = None
 
     def scatter(self, h: float, affine: float, change: Sequence[float]) -> None:
         """Particles to nodes: velocities after `h` seconds of stress, plus `change` m/s.
@@ -263,7 +265,17 @@ class Grid:
 
     def has_strayed(self) -> bool:
         """Whether a particle lies too far from its block to go on without `sort`."""
-        return bool(self.strayed.numpy().any())
+        return bool(self._views()[0].any())
+
+    def fastest(self) -> float:
+        """Largest SPEED of the particles, m/s; NaN where one is no number."""
+        return float(self._views()[1].max())
+
+    def _views(self) -> tuple[np.ndarray, np.ndarray]:
+        """`strayed` and the row SPEED: on the CPU the arrays' own memory, taken once after each `sort`."""
+        if self._seen is None or self.device != "cpu":
+            self._seen = (self.strayed.numpy(), self.particles[SPEED].numpy()[: len(self.ids)])
+        return self._seen
 
     def rows(self, first: int, count: int) -> np.ndarray:
         """[N, count] numbers of each particle from row `first` on, in the model's order."""

@@ -165,7 +165,7 @@ class SolverMPM:
 
     def _largest_step(self) -> float:
         """Longest stable substep, s."""
-        fastest = float(self.grid.particles[rows.SPEED].numpy().max())
+        fastest = self.grid.fastest()
         if not math.isfinite(fastest):
             raise SolverError(
                 f"particles are lost at t = {self._time:.6g} s: their speed is no number; use a smaller "
