@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,7 +95,7 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
 
 def grid(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
     """Nodes [n, 3] m of the grid around a body, Z fastest, and their weights [P, n] at its vertices."""
-    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    low, high = _box(body)
     order = 1 if body.reduction == "trilinear" else 2
     counts = [order * c + 1 for c in body.cells]
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
@@ -113,6 +114,19 @@ def grid(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
     return nodes, np.einsum("pi,pj,pk->pijk", *each).reshape(len(body.vertices), -1)
 
 
+def _box(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the grid [3], [3] m: around the body, and so that all nodes are numbers of six digits.
+
+    MJCF keeps no more, and a grid must be a grid still when it is read back.
+    """
+    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    intervals = np.asarray(body.cells) * (1 if body.reduction == "trilinear" else 2)
+    unit = 10.0 ** (math.floor(math.log10(float(np.abs([low, high]).max()))) - 5)
+    first = np.floor(low / unit)
+    step = np.ceil((high / unit - first) / intervals)
+    return first * unit, (first + step * intervals) * unit
+
+
 def _leaders(body: SoftBody, positions: np.ndarray, masses: np.ndarray, held: np.ndarray) -> np.ndarray:
     """[n] the node that each goes with: itself, or the nearest free one where the body does not reach it.
 
@@ -128,7 +142,7 @@ def _leaders(body: SoftBody, positions: np.ndarray, masses: np.ndarray, held: np
 
 def _reached(body: SoftBody) -> np.ndarray:
     """Nodes [n] bool of cells that hold the middle of a tet."""
-    low, high = body.vertices.min(axis=0), body.vertices.max(axis=0)
+    low, high = _box(body)
     cells, order = np.asarray(body.cells), 1 if body.reduction == "trilinear" else 2
     middles = body.vertices[body.tets].mean(axis=1)
     at = np.clip(((middles - low) / (high - low) * cells).astype(int), 0, cells - 1)
