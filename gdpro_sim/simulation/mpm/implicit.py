@@ -11,8 +11,7 @@ import warp as wp
 
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import linalg, mpm_implicit, mpm_newton, mpm_stiffness
-from gdpro_sim.materials import Material
-from gdpro_sim.simulation.model import MpmSettings, Particles
+from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mpm.boundaries import Boundary
 from gdpro_sim.simulation.mpm.grid import Grid
 from gdpro_sim.simulation.mpm.matter import Matter, flows
@@ -47,18 +46,19 @@ class GridNewton:
     """Finds the grid's velocities at the end of a substep; see `gdpro_sim.kernels.mpm_implicit`.
 
     Memory grows with the grid and is kept. Raises SolverError for materials that flow or tear, and for
-    boundaries with a state of their own.
+    colliders with a mass.
     """
 
     def __init__(
         self,
         grid: Grid,
-        particles: Particles,
+        model: Model,
         matter: Matter,
         boundaries: tuple[Boundary, ...],
-        settings: MpmSettings,
     ) -> None:
-        check(matter.materials, boundaries)
+        check(model)
+        assert model.particles is not None
+        particles, settings = model.particles, model.mpm
         self.grid, self.boundaries, self.settings = grid, boundaries, settings
         self.table = matter.table
         self._iterations = 0
@@ -420,18 +420,21 @@ class GridNewton:
         return float(self._sums.numpy().sum()), math.sqrt(float(self._more_sums.numpy().max()))
 
 
-def check(materials: tuple[Material, ...], boundaries: tuple[Boundary, ...]) -> None:
+def check(model: Model) -> None:
     """Raise SolverError for what the implicit integrator cannot simulate."""
-    for material in materials:
+    assert model.particles is not None
+    for material in model.particles.materials:
         if flows(material):
             raise SolverError(
                 f'the implicit integrator is for elastic materials, and one with the law "{material.model}" '
                 'flows, yields or tears here: use integrator "explicit"'
             )
-    if any(boundary.state() for boundary in boundaries):
-        raise SolverError(
-            'the implicit integrator does not move rigid bodies: use integrator "explicit", or fix them'
-        )
+    for collider in model.colliders:
+        if collider.mass is not None:
+            raise SolverError(
+                f"the implicit integrator does not move rigid bodies, and collider {collider.name!r} has a "
+                'mass: use integrator "explicit", or set its mass to null'
+            )
 
 
 __all__ = ["GridNewton", "Outcome", "check"]

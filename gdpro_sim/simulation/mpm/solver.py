@@ -67,7 +67,7 @@ class SolverMPM:
         self._newton = None
         self._viscous_step = self.matter.largest_step(self.spacing)
         if settings.integrator == "implicit":
-            self._newton = GridNewton(self.grid, particles, self.matter, self.boundaries, settings)
+            self._newton = GridNewton(self.grid, model, self.matter, self.boundaries)
         self._time = 0.0
         self._counters = _Counters()
         self._others = {
