@@ -3,8 +3,8 @@
 A node in or beside an obstacle, up to half a cell outside, has a velocity v, the obstacle there u, the
 outward normal is n. The matter at the node is a gap away from the obstacle: that of the nearest particle
 which the node's spline reaches, less the particle's radius. Of the relative velocity
-r = v - u + n max(gap, 0) / h, whose normal part is negative where the gap would close within the substep of
-length h, is left
+r = v - u + s n, where s = gap / h is the speed at which the gap would close within the substep of length h
+(or, where they overlap, a slow speed that takes matter out), is left
 
     sticky    0 where it touches or closes
     slip      r - (r.n) n where it touches or closes
@@ -61,6 +61,12 @@ OUTSIDE = wp.constant(0.5)
 TOUCHING = wp.constant(0.05)
 """Cells of a gap that a sticky or slippery obstacle holds closed."""
 
+RECOVERY = wp.constant(0.5)
+"""s, in which matter that an obstacle overlaps is pushed out of it. Ten times as fast makes bodies hop."""
+
+DEEPEST = wp.constant(0.5)
+"""Cells of overlap that count for how fast."""
+
 FAR = wp.constant(1.0e30)
 """Gap of a node without matter near, m."""
 
@@ -107,6 +113,17 @@ def distance_to(collider: Collider, table: wp.array2d[wp.float64], c: int, x: wp
     q = wp.transpose(rotation) * (x - row_vector(table, c, ORIGIN))
     distance, normal = local_distance(collider, q, collider.size[0])
     return distance, rotation * normal
+
+
+@wp.func
+def closing_speed(gap: float, kind: int, h: float, spacing: float) -> float:
+    """m/s at which matter a gap away may come nearer; negative where it has to leave."""
+    speed = gap / h
+    if gap < 0.0:
+        speed = wp.max(gap, -DEEPEST * spacing) / RECOVERY
+        if kind == STICKY:
+            speed = 0.0
+    return speed
 
 
 @wp.func
@@ -502,7 +519,7 @@ def meet_obstacles(
                     open = gap[64 * pair + n]
                     if open < FAR and kind != ABSENT:
                         normal = wp.vec3(f[0], f[1], f[2])
-                        allowed = (wp.max(open, 0.0) / h) * normal
+                        allowed = closing_speed(open, kind, h, float(spacing)) * normal
                         u = obstacle_velocity(table, c, x) - allowed
                         old = v
                         if meets(v - u, normal, open, kind, float(spacing)):
@@ -547,7 +564,7 @@ def sum_coupling(
 ):
     """What the nodes of each pair of obstacle c would give it, linear in its velocity around the table's.
 
-    A node of mass m at a lever r gives the impulse m D (v + n gap / h - u - w x r), u and w the obstacle's
+    A node of mass m at a lever r gives the impulse m D (v + s n - u - w x r), u and w the obstacle's
     linear and angular velocity, with D = 1 where it sticks, n n^T where it slips, (n - mu t) n^T where it
     slides along the direction t, 0 where it does not touch.
 
@@ -568,7 +585,8 @@ def sum_coupling(
         if value[3] > 0.0 and open < FAR and kind != ABSENT:
             x = node_position(blocks[block], n, spacing)
             normal = wp.vec3(f[0], f[1], f[2])
-            v = wp.vec3(value[0], value[1], value[2]) + (wp.max(open, 0.0) / h) * normal
+            v = wp.vec3(value[0], value[1], value[2])
+            v += closing_speed(open, kind, h, float(spacing)) * normal
             r = v - obstacle_velocity(table, c, x)
             along = wp.dot(r, normal)
             D = wp.mat33()

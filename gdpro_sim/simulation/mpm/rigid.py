@@ -21,9 +21,12 @@ FRICTION = 0.5
 """Coulomb coefficient of a body and a plane that neither say one."""
 
 SWEEPS = 30
-"""Times that the points of a body that touch planes are gone through in a substep."""
+"""Most times that the points of a body that touch planes are gone through in a substep."""
 
-RIM = 16
+SETTLED = 1e-10
+"""Share of the largest impulse; smaller changes in one sweep are enough."""
+
+RIM = 8
 """Points around each end of a cylinder that meet planes."""
 
 POSITION, ROTATION, VELOCITY, MOMENT = slice(0, 3), slice(3, 12), slice(12, 15), slice(15, 18)
@@ -177,26 +180,34 @@ class RigidBodies:
         row, mass = self._rows[k], self.mass[k]
         inverse = np.linalg.inv(self.inertia(k))
         pressed, rubbed = np.zeros(len(touching)), np.zeros((len(touching), 3))
+        answers = []
+        for (_point, normal, _velocity, _friction), lever, _gap in touching:
+            arm = _cross_matrix(lever)
+            answer = np.eye(3) / mass - arm @ inverse @ arm  # velocity of the point for an impulse
+            answers.append((arm, normal @ answer @ normal, np.trace(answer) / 3.0))
         for _ in range(SWEEPS):
-            for i, ((_point, normal, velocity, friction), lever, gap) in enumerate(touching):
-                arm = _cross_matrix(lever)
-                answer = np.eye(3) / mass - arm @ inverse @ arm  # velocity of the point for an impulse
+            changed = 0.0
+            for i, ((_point, normal, velocity, friction), _lever, gap) in enumerate(touching):
+                arm, soft, softest = answers[i]
                 slip = row[VELOCITY] - arm @ (inverse @ row[MOMENT]) - velocity
-                press = max(0.0, pressed[i] - (slip @ normal + gap / h) / (normal @ answer @ normal))
+                press = max(0.0, pressed[i] - (slip @ normal + gap / h) / soft)
                 change = (press - pressed[i]) * normal
+                changed = max(changed, abs(press - pressed[i]))
                 pressed[i] = press
                 row[VELOCITY] += change / mass
                 row[MOMENT] += arm @ change
                 slip = row[VELOCITY] - arm @ (inverse @ row[MOMENT]) - velocity
                 across = slip - (slip @ normal) * normal
-                stiff = np.trace(answer) / 3.0
-                rub = rubbed[i] - across / stiff
+                rub = rubbed[i] - across / softest
                 limit = _coefficient(self._friction[k], friction) * press
                 rub *= min(1.0, limit / max(float(np.linalg.norm(rub)), 1e-300))
                 change = rub - rubbed[i]
+                changed = max(changed, float(np.abs(change).max()))
                 rubbed[i] = rub
                 row[VELOCITY] += change / mass
                 row[MOMENT] += arm @ change
+            if changed <= SETTLED * pressed.max():
+                break
 
     def _lift(self, k: int, h: float, planes: list[Plane]) -> None:
         """Out of planes that rounding or turning has brought it into."""

@@ -1,0 +1,598 @@
+"""MPM's boundaries: obstacles stop, rub and let go; what is held, driven and pushed; rigid bodies."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter, ValidationError
+from scipy.spatial.transform import Rotation
+
+from gdpro_sim import device as devices
+from gdpro_sim.errors import SolverError
+from gdpro_sim.materials import Material
+from gdpro_sim.simulation.colliders import Collider, ColliderOptions, compile_collider
+from gdpro_sim.simulation.conditions import Force, Hold, Impulse, Motion, Wind
+from gdpro_sim.simulation.fem import SolverFEM
+from gdpro_sim.simulation.model import Ground, Model, MpmSettings, Particles
+from gdpro_sim.simulation.mpm import SolverMPM
+from gdpro_sim.simulation.mpm.boundaries import Obstacles, collider_poses
+from gdpro_sim.simulation.mpm.rigid import RigidBodies, recentred
+from tests.simulation.fem_models import make_model, tet_box
+from tests.simulation.test_colliders import box_mesh
+
+GRAVITY = (0.0, 0.0, -9.81)
+
+
+def collider(**options: Any) -> Collider:
+    return compile_collider(TypeAdapter(ColliderOptions).validate_python(options))
+
+
+def block(
+    cells: tuple[int, int, int] = (4, 4, 4),
+    *,
+    size: float = 0.05,
+    low: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    young: float = 2.0e5,
+    poisson: float = 0.3,
+    friction: float = 0.5,
+    damping: float = 0.0,
+    turn: np.ndarray | None = None,
+    **model: Any,
+) -> Model:
+    """A block of `cells` cells of `size` m, 8 particles each, its lower corner at `low`, then turned."""
+    spacing = 0.5 * size
+    axes = [spacing * (np.arange(2 * n) + 0.5) for n in cells]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) + low
+    v = np.tile(velocity, (len(x), 1))
+    if turn is not None:
+        x, v = x @ turn.T, v @ turn.T
+    material = Material(
+        model="neo_hookean", young=young, poisson=poisson, density=1000.0, friction=friction,
+        rayleigh_mass=damping,
+    )  # fmt: skip
+    particles = Particles(
+        positions=x.astype(np.float32),
+        velocities=v.astype(np.float32),
+        volumes=np.full(len(x), spacing**3, np.float32),
+        matter=np.zeros(len(x), np.int32),
+        materials=(material,),
+        spacing=spacing,
+    )
+    return Model.of_particles(particles, **model)
+
+
+def run(solver: SolverMPM, seconds: float, frame: float = 1.0 / 60.0) -> SolverMPM:
+    for _ in range(round(seconds / frame)):
+        solver.step(frame)
+    return solver
+
+
+def tilted(angle: float, rubbing: float | None, **options: Any) -> Model:
+    """A block on a plane through the origin that falls off towards +X."""
+    turn = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+    plane = collider(kind="plane", rotation=(0.0, angle, 0.0), friction=rubbing)
+    return block(turn=turn, colliders=(plane,), gravity=GRAVITY, **options)
+
+
+def downhill(solver: SolverMPM, angle: float) -> float:
+    """m, of the middle along the plane."""
+    along = Rotation.from_euler("y", angle, degrees=True).apply([1.0, 0.0, 0.0])
+    return float(solver.positions.mean(axis=0) @ along)
+
+
+# -- Friction
+
+
+@pytest.mark.parametrize(
+    ("angle", "rubbing", "of_matter"), [(35.0, None, 0.5), (20.0, 0.0, 0.5), (20.0, 0.2, 0.5)]
+)
+def test_slides_by_the_exact_acceleration_above_the_friction_angle(
+    angle: float, rubbing: float | None, of_matter: float
+) -> None:
+    """However it bounces: what friction takes is mu times what the plane gives, so v_t + mu v_n grows evenly.
+
+    The friction of matter and plane combine by the geometric mean.
+    """
+    solver = SolverMPM(tilted(angle, rubbing, friction=of_matter))
+    mu = of_matter if rubbing is None else np.sqrt(of_matter * rubbing)
+    turn = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+    run(solver, 0.1)
+    before, begin = solver.velocities.mean(axis=0) @ turn, solver.time
+    run(solver, 0.3)
+    gained = solver.velocities.mean(axis=0) @ turn - before
+    expected = 9.81 * (np.sin(np.radians(angle)) - mu * np.cos(np.radians(angle)))
+    assert (gained[0] + mu * gained[2]) / (solver.time - begin) == pytest.approx(expected, rel=5e-3)
+
+
+@pytest.mark.parametrize("angle", [15.0, 23.0])
+def test_sticks_below_the_friction_angle(angle: float) -> None:
+    """atan 0.5 is 26.6 degrees."""
+    solver = run(SolverMPM(tilted(angle, None, friction=0.5, damping=10.0)), 0.5)
+    settled = downhill(solver, angle)
+    run(solver, 0.5)
+    assert abs(downhill(solver, angle) - settled) < 2e-4
+
+
+def test_two_materials_rub_each_by_its_own_friction() -> None:
+    """Two blocks far apart on one floor: v = v0 - mu g t, each with its mu."""
+    model = block(velocity=(1.0, 0.0, 0.0), gravity=GRAVITY, ground=Ground())
+    p = model.particles
+    assert p is not None
+    other = p.materials[0].model_copy(update={"friction": 0.1})
+    both = Particles(
+        np.concatenate([p.positions, p.positions + np.float32([0.0, 1.0, 0.0])]),
+        np.concatenate([p.velocities] * 2),
+        np.concatenate([p.volumes] * 2),
+        np.repeat(np.int32([0, 1]), len(p)),
+        (p.materials[0], other),
+        p.spacing,
+    )
+    solver = run(SolverMPM(dataclasses.replace(model, particles=both)), 0.15, 0.01)
+    first, second = solver.velocities[:, 0].reshape(2, -1).mean(axis=1)
+    assert first == pytest.approx(1.0 - 0.5 * 9.81 * 0.15, rel=0.05)
+    assert second == pytest.approx(1.0 - 0.1 * 9.81 * 0.15, rel=0.02)
+
+
+# -- Sticky, slip, separate
+
+
+def flying(boundary: str, velocity: tuple[float, float, float]) -> SolverMPM:
+    plane = collider(kind="plane", boundary=boundary, friction=1.0)
+    return SolverMPM(block(velocity=velocity, low=(0.0, 0.0, 0.0), colliders=(plane,), gravity=(0.0,) * 3))
+
+
+def test_slip_keeps_tangential_momentum_and_does_not_let_go() -> None:
+    solver = flying("slip", (1.0, 0.5, -0.2))
+    before = solver.diagnostics().momentum
+    run(solver, 0.2)
+    after = solver.diagnostics().momentum
+    assert after[0] == pytest.approx(before[0], rel=1e-5)
+    assert after[1] == pytest.approx(before[1], rel=1e-5)
+    low = [run(solver, 1 / 60).positions[:, 2].min() for _ in range(20)]
+    assert max(low) < 0.0125 * 1.1 and min(low) > 0.0125 * 0.5
+
+
+def test_sticky_stops_what_touches() -> None:
+    solver = run(flying("sticky", (1.0, 0.0, -0.5)), 1 / 30)
+    bottom = solver.positions[:, 2] < 0.015
+    assert bottom.sum() > 50
+    assert np.abs(solver.velocities[bottom]).max() < 0.3
+    pulled = solver.positions[bottom, 0].mean()
+    run(solver, 0.5)
+    assert abs(solver.positions[bottom, 0].mean() - pulled) < 0.025  # half a cell of shear
+
+
+def test_separate_lets_go_at_once() -> None:
+    solver = flying("separate", (0.3, 0.0, 0.4))
+    before = solver.diagnostics().momentum
+    run(solver, 0.2)
+    assert solver.diagnostics().momentum == pytest.approx(before, rel=1e-5, abs=1e-6)
+    assert solver.positions[:, 2].min() > 0.0125 + 0.078
+
+
+def test_matter_meets_the_floor_where_it_is() -> None:
+    """Wherever the floor lies between nodes, the lowest particle rests half its spacing above."""
+    for height in (0.0, 0.013, -0.021):
+        model = block(
+            (2, 2, 2),
+            low=(0.0, 0.0, height + 0.02),
+            young=3e5,
+            damping=20.0,
+            gravity=GRAVITY,
+            ground=Ground(height),
+        )
+        solver = run(SolverMPM(model), 0.7)
+        gap = solver.positions[:, 2].min() - 0.0125 - height
+        assert abs(gap) < 0.05 * solver.spacing
+
+
+def test_a_fast_fall_does_not_pass_through_and_nothing_creeps() -> None:
+    model = block(
+        low=(0.0, 0.0, 0.1), velocity=(0.0, 0.0, -4.0), damping=8.0, gravity=GRAVITY, ground=Ground()
+    )
+    solver = run(SolverMPM(model), 0.7)
+    lowest = solver.positions[:, 2].min()
+    assert lowest > 0.0
+    run(solver, 0.5)
+    assert solver.positions[:, 2].min() > lowest - 1e-4
+
+
+@pytest.mark.slow
+def test_nothing_creeps_through_a_floor_in_ten_seconds() -> None:
+    solver = run(
+        SolverMPM(block((4, 4, 8), young=3e4, damping=4.0, gravity=GRAVITY, ground=Ground(0.007))), 2.0
+    )
+    settled = solver.positions
+    run(solver, 10.0)
+    assert np.abs(solver.positions - settled).max() < 1e-4
+
+
+# -- Shapes and motion
+
+SHAPES: dict[str, dict[str, Any]] = {
+    "box": {"kind": "box", "size": (0.6, 0.6, 0.2), "position": (0.1, 0.1, -0.1)},
+    "sphere": {"kind": "sphere", "radius": 0.6, "position": (0.1, 0.1, -0.6)},
+    "capsule": {
+        "kind": "capsule", "radius": 0.3, "length": 0.6, "position": (0.1, 0.1, -0.3), "rotation": (0, 90, 0),
+    },
+    "cylinder": {"kind": "cylinder", "radius": 0.5, "length": 0.2, "position": (0.1, 0.1, -0.1)},
+    "heightfield": {"kind": "heightfield", "size": (1.0, 1.0), "heights": [[0.0, 0.0], [0.0, 0.0]]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_every_shape_holds_matter_up(name: str) -> None:
+    shape = collider(**SHAPES[name])
+    model = block(low=(0.0, 0.0, 0.01), damping=20.0, gravity=GRAVITY, colliders=(shape,))
+    solver = run(SolverMPM(model), 0.4)
+    top = solver.positions[:, 2].max()
+    assert 0.16 < top < 0.2
+    assert solver.positions[:, 2].min() > (-0.06 if name in ("sphere", "capsule") else 0.0)
+
+
+def test_a_wall_pushes_at_its_speed() -> None:
+    wall = collider(
+        kind="box", size=(0.2, 1.0, 1.0), position=(-0.12, 0.0, 0.0), friction=0.0,
+        motion=[{"time": 1.0, "translation": (0.5, 0.0, 0.0)}],
+    )  # fmt: skip
+    solver = run(SolverMPM(block(damping=0.0, young=1e6, colliders=(wall,), gravity=(0.0,) * 3)), 0.5)
+    wall_face = -0.02 + 0.25
+    assert solver.positions[:, 0].min() > wall_face
+    # Pushed without loss it leaves at up to twice the wall's speed.
+    assert 0.5 * 0.98 < solver.velocities[:, 0].mean() < 1.0
+
+
+def test_a_belt_carries_what_lies_on_it() -> None:
+    belt = collider(
+        kind="box", size=(9.0, 1.0, 0.2), position=(0.0, 0.0, -0.1),
+        motion=[{"time": 10.0, "translation": (10.0, 0.0, 0.0)}],
+    )  # fmt: skip
+    solver = run(SolverMPM(block(colliders=(belt,), gravity=GRAVITY, young=1e6, damping=0.0)), 0.1, 0.01)
+    assert solver.velocities[:, 0].mean() == pytest.approx(0.5 * 9.81 * 0.1, rel=0.05)  # it slips: mu g t
+    run(solver, 0.4)
+    assert solver.velocities[:, 0].mean() == pytest.approx(1.0, rel=0.02)
+
+
+def test_a_sticky_drum_turns_what_it_holds() -> None:
+    drum = collider(
+        kind="box", size=(0.2, 0.2, 0.1), position=(0.1, 0.1, 0.05), boundary="sticky",
+        motion=[{"time": 1.0, "rotation": (0.0, 0.0, 90.0)}],
+    )  # fmt: skip
+    solver = SolverMPM(block(young=1e6, colliders=(drum,), gravity=(0.0,) * 3))
+    start = solver.positions - [0.1, 0.1, 0.0]
+    inside = start[:, 2] < 0.05
+    run(solver, 0.5)
+    expected = Rotation.from_euler("z", 45, degrees=True).apply(start[inside])
+    assert np.abs(solver.positions[inside] - [0.1, 0.1, 0.0] - expected).max() < 2e-3
+
+
+def test_a_collider_is_there_from_start_to_end() -> None:
+    floor = collider(kind="plane", boundary="separate", friction=0.0, end=0.1)
+    solver = run(SolverMPM(block(colliders=(floor,), gravity=GRAVITY)), 0.1, 0.02)
+    assert abs(solver.velocities[:, 2].mean()) < 0.1
+    run(solver, 0.1, 0.02)
+    assert solver.velocities[:, 2].mean() == pytest.approx(-0.981, abs=0.11)
+    late = collider(kind="plane", start=10.0)
+    solver = run(SolverMPM(block(colliders=(late,), gravity=GRAVITY)), 0.1, 0.02)
+    assert solver.velocities[:, 2].mean() == pytest.approx(-0.981, rel=1e-4)
+
+
+def test_a_corner_of_two_planes_holds_matter_from_both_sides() -> None:
+    sides = tuple(collider(kind="plane", normal=(s, 0.0, 1.0), friction=0.0) for s in (1.0, -1.0))
+    turn = Rotation.from_euler("y", 45, degrees=True).as_matrix()
+    model = block(low=(-0.2, 0.0, 0.0), turn=turn, colliders=sides, gravity=GRAVITY, damping=20.0, young=1e6)
+    solver = run(SolverMPM(model), 0.7)
+    x = solver.positions
+    for s in (1.0, -1.0):
+        gap = (x @ np.array([s, 0.0, 1.0]) / np.sqrt(2.0)).min() - 0.0125
+        assert abs(gap) < 0.1 * solver.spacing
+    assert np.abs(solver.velocities).max() < 2e-2
+
+
+# -- Domain
+
+
+def test_particles_stay_in_the_domain() -> None:
+    domain = ((-0.05, -0.05, -0.05), (0.35, 0.35, 0.35))
+    model = block(velocity=(3.0, 2.0, -4.0), young=3e4, mpm=MpmSettings(domain=domain), gravity=GRAVITY)
+    solver = SolverMPM(model)
+    for _ in range(40):
+        solver.step(1 / 60)
+        x = solver.positions
+        assert (x >= np.float32(domain[0])).all() and (x <= np.float32(domain[1])).all()
+
+
+def test_what_starts_outside_the_domain_is_refused() -> None:
+    with pytest.raises(SolverError, match="start outside the domain"):
+        SolverMPM(block(mpm=MpmSettings(domain=((0.0,) * 3, (0.1,) * 3))))
+    with pytest.raises(SolverError, match="must lie above"):
+        SolverMPM(block(mpm=MpmSettings(domain=((0.0,) * 3, (0.0,) * 3))))
+
+
+# -- Held, driven, pushed
+
+
+def test_what_is_held_stays_and_does_not_creep() -> None:
+    """A bar that hangs by its upper end stretches as it should, and keeps so."""
+    model = block((2, 2, 8), young=1e5, poisson=0.0, damping=20.0, gravity=GRAVITY)
+    assert model.particles is not None
+    top = np.flatnonzero(model.particles.positions[:, 2] > 0.3).astype(np.int32)
+    solver = run(SolverMPM(dataclasses.replace(model, holds=(Hold(top),))), 0.6)
+    start = model.particles.positions
+    assert np.array_equal(solver.positions[top].astype(np.float32), start[top])
+    assert not solver.velocities[top].any()
+    sag = start[:, 2].min() - solver.positions[:, 2].min()
+    assert sag == pytest.approx(1000.0 * 9.81 * 0.3**2 / (2.0 * 1e5), rel=0.1)
+    deformed = solver.deformations[top]
+    run(solver, 0.6)
+    assert start[:, 2].min() - solver.positions[:, 2].min() == pytest.approx(sag, rel=0.01)
+    assert np.abs(solver.deformations[top] - deformed).max() < 2e-3
+
+
+def motion(
+    *, shift: tuple[float, float, float] = (0.0,) * 3, turn: float = 0.0, seconds: float = 1.0
+) -> Motion:
+    """Over some seconds; turned about the vertical axis through (0.1, 0.1)."""
+    return Motion(
+        vertices=np.zeros(0, np.int32),
+        pivot=np.array([0.1, 0.1, 0.0]),
+        times=np.array([0.0, seconds]),
+        translations=np.array([(0.0,) * 3, shift]),
+        rotations=np.radians([(0.0,) * 3, (0.0, 0.0, turn)]),
+    )
+
+
+def test_driven_particles_go_where_they_are_taken_and_take_the_rest_along() -> None:
+    way = motion(shift=(0.3, 0.0, 0.1), turn=180.0)
+    model = block(young=1e6, gravity=(0.0,) * 3)
+    assert model.particles is not None
+    start = model.particles.positions.astype(np.float64)
+    low = np.flatnonzero(start[:, 2] < 0.1).astype(np.int32)
+    solver = run(SolverMPM(dataclasses.replace(model, holds=(Hold(low, way),))), 0.5)
+    turned = (
+        Rotation.from_euler("z", 90, degrees=True).apply(start - way.pivot) + way.pivot + [0.15, 0.0, 0.05]
+    )
+    assert np.abs(solver.positions[low] - turned[low]).max() < 1e-6
+    assert np.abs(solver.positions - turned).max() < 0.04  # the rest has started with a jerk
+    assert np.linalg.det(solver.deformations[low]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_holds_begin_and_end() -> None:
+    model = block(gravity=GRAVITY)
+    everything = np.arange(len(model.particles or ()), dtype=np.int32)
+    hold = Hold(everything, start=0.1, release=0.2)
+    solver = run(SolverMPM(dataclasses.replace(model, holds=(hold,))), 0.1, 0.02)
+    fallen = solver.positions[:, 2].mean()
+    assert fallen == pytest.approx(0.1 - 0.5 * 9.81 * 0.01, abs=1e-3)
+    run(solver, 0.1, 0.02)
+    assert solver.positions[:, 2].mean() == pytest.approx(fallen, abs=1e-4)
+    run(solver, 0.1, 0.02)
+    assert solver.velocities[:, 2].mean() == pytest.approx(-0.981, rel=1e-2)
+
+
+def test_forces_and_impulses_give_what_they_say() -> None:
+    model = block(gravity=(0.0,) * 3)
+    ids = np.arange(len(model.particles or ()), dtype=np.int32)
+    each = np.full((len(ids), 3), 1.0 / len(ids))
+    loads = (
+        Force(ids, 5.0 * each, start=0.01, end=0.03),
+        Impulse(ids, 2.0 * each, time=0.05),
+        Impulse(ids[:1], 0.01 * np.ones((1, 3)), time=0.0),
+    )
+    solver = SolverMPM(dataclasses.replace(model, loads=loads))
+    for seconds, expected in ((0.02, 0.01 + 0.05), (0.02, 0.01 + 0.1), (0.02, 2.11)):
+        run(solver, seconds, 0.01)
+        assert solver.diagnostics().momentum == pytest.approx((expected,) * 3, rel=1e-4)
+    saved = solver.state_dict()
+    solver.load_state_dict(saved)
+    run(solver, 0.02, 0.01)
+    assert solver.diagnostics().momentum == pytest.approx((2.11,) * 3, rel=1e-4)
+
+
+def test_loads_on_surfaces_are_refused() -> None:
+    wind = Wind(np.zeros((1, 3), np.int32), (1.0, 0.0, 0.0), 1.2, 1.0, 0.0)
+    with pytest.raises(SolverError, match="no wind loads"):
+        SolverMPM(block(loads=(wind,)))
+
+
+# -- Rigid bodies
+
+
+def bodies_of(solver: SolverMPM) -> RigidBodies:
+    (found,) = (b.bodies for b in solver.boundaries if isinstance(b, Obstacles))
+    return found
+
+
+BALL: dict[str, Any] = {"kind": "sphere", "radius": 0.08, "mass": 2.0}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {**BALL, "position": (0.3, 0.11, 0.12), "velocity": (-2.0, 0.0, 0.0), "angular_velocity": (0, 0, 20)},
+        {**BALL, "mass": 0.05, "position": (0.3, 0.13, 0.1), "velocity": (-2.0, 0.0, 0.0)},
+        {**BALL, "mass": 0.3, "position": (0.28, 0.1, 0.1), "velocity": (-1.0, 0, 0), "boundary": "sticky"},
+        {
+            "kind": "box", "size": (0.1, 0.2, 0.12), "mass": 3.0, "position": (0.3, 0.15, 0.1),
+            "velocity": (-2, 0, 0),
+        },
+    ],
+    ids=["ball", "light ball", "sticky ball", "box"],
+)  # fmt: skip
+def test_a_rigid_body_and_matter_keep_their_momentum(options: dict[str, Any]) -> None:
+    solver = SolverMPM(block(gravity=(0.0,) * 3, colliders=(collider(**options),)))
+    bodies = bodies_of(solver)
+    before = np.array([bodies.momentum, bodies.angular_momentum])
+    energy = bodies.kinetic_energy
+    run(solver, 0.3)
+    d = solver.diagnostics()
+    after = before * 0 + [bodies.momentum + d.momentum, bodies.angular_momentum + d.angular_momentum]
+    scale = np.linalg.norm(before[0])
+    assert np.abs(np.asarray(d.momentum)).max() > 0.2 * scale  # they have met
+    assert np.abs(after - before).max() < 2e-5 * scale
+    assert bodies.kinetic_energy + d.kinetic_energy + d.elastic_energy < energy * 1.001
+
+
+def test_a_rigid_body_rests_on_matter_and_sinks_by_its_weight() -> None:
+    """A slab of 0.2 x 0.2 m on a cube with the same faces: E strain = weight / area."""
+    slab = collider(kind="box", size=(0.2, 0.2, 0.1), position=(0.1, 0.1, 0.25), mass=10.0, friction=0.0)
+    model = block(
+        young=1e5,
+        poisson=0.0,
+        damping=20.0,
+        gravity=GRAVITY,
+        colliders=(slab,),
+        ground=Ground(),
+        friction=0.0,
+    )
+    solver = run(SolverMPM(model), 1.5)
+    sag = 0.25 - bodies_of(solver).positions[0, 2]
+    expected = 0.2 * (10.0 * 9.81 / 0.04 + 0.5 * 1000.0 * 9.81 * 0.2) / 1e5
+    assert abs(sag - expected) < 0.06 * solver.spacing
+    assert np.abs(bodies_of(solver).velocities).max() < 1e-2
+
+
+def far(**model: Any) -> Model:
+    """A model whose matter takes no part, and little time."""
+    return block((1, 1, 1), young=1e4, **model)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "capsule", "cylinder", "mesh"])
+def test_rigid_bodies_meet_the_ground(kind: str) -> None:
+    shapes: dict[str, dict[str, Any]] = {
+        "sphere": {"radius": 0.1},
+        "box": {"size": (0.2, 0.3, 0.2)},
+        "capsule": {"radius": 0.1, "length": 0.2, "rotation": (90.0, 0.0, 0.0)},
+        "cylinder": {"radius": 0.1, "length": 0.2},
+    }
+    common: dict[str, Any] = {"mass": 2.0, "position": (2.0, 0.0, 0.15)}
+    if kind == "mesh":
+        body = box_mesh((0.2, 0.3, 0.2), mass=2.0, position=np.array([2.0, 0.0, 0.15]))
+    else:
+        body = collider(kind=kind, **shapes[kind], **common)
+    solver = run(SolverMPM(far(colliders=(body,), gravity=GRAVITY, ground=Ground())), 0.4)
+    (turn, shift), *_ = collider_poses(solver.boundaries, solver.model, solver.time)
+    assert bodies_of(solver).positions[0, 2] == pytest.approx(0.1, abs=1e-6)
+    assert np.abs(bodies_of(solver).velocities).max() < 1e-6
+    assert np.abs(turn - np.eye(3)).max() < 1e-6
+    assert shift == pytest.approx((0.0, 0.0, -0.05), abs=1e-6)
+
+
+def test_a_ball_that_slides_begins_to_roll() -> None:
+    """v = 5/7 of what it had, however it rubs."""
+    ball = collider(
+        kind="sphere", radius=0.1, mass=1.0, position=(2.0, 0, 0.1), velocity=(0.7, 0, 0), friction=0.4
+    )
+    solver = run(SolverMPM(far(colliders=(ball,), gravity=GRAVITY, ground=Ground())), 0.3)
+    bodies = bodies_of(solver)
+    assert bodies.velocities[0, 0] == pytest.approx(0.5, rel=1e-3)
+    assert bodies.angular_velocities[0, 1] == pytest.approx(5.0, rel=1e-3)
+
+
+def test_a_free_body_keeps_its_angular_momentum_and_energy() -> None:
+    box = collider(
+        kind="box", size=(0.1, 0.2, 0.3), mass=1.0, position=(2, 0, 0), angular_velocity=(0.1, 5.0, 0.1)
+    )
+    bodies = RigidBodies([box], (0.0, 0.0, 0.0))
+    energy, momentum = bodies.kinetic_energy, bodies.angular_momentum
+    for _ in range(2000):
+        bodies.begin(1e-3)
+        bodies.move(1e-3, [])
+    assert bodies.angular_momentum == pytest.approx(momentum, rel=1e-12)
+    assert bodies.kinetic_energy == pytest.approx(energy, rel=2e-2)
+
+
+def test_inertia_of_a_mesh_is_that_of_its_shape() -> None:
+    mesh = recentred(box_mesh((0.2, 0.3, 0.4), mass=2.0, position=np.array([1.0, 2.0, 3.0])))
+    box = collider(kind="box", size=(0.2, 0.3, 0.4), mass=2.0, position=(1.0, 2.0, 3.0))
+    found = [RigidBodies([item], (0.0, 0.0, 0.0)) for item in (mesh, box)]
+    assert found[0].inertia(0) == pytest.approx(found[1].inertia(0), rel=1e-9, abs=1e-12)
+    assert found[0].positions == pytest.approx(found[1].positions)
+
+
+# -- Reproducible
+
+
+@pytest.fixture
+def restore_threads() -> Iterator[None]:
+    count = devices.thread_count()
+    yield
+    devices.set_thread_count(count)
+
+
+def tumbling() -> Model:
+    colliders = (
+        collider(kind="sphere", radius=0.1, position=(0.1, 0.1, -0.2)),
+        collider(**BALL, position=(0.1, 0.1, 0.35), velocity=(0.0, 0.0, -2.0)),
+        box_mesh((1.0, 1.0, 0.2), position=np.array([0.0, 0.0, -0.3])),
+        collider(
+            kind="box", size=(0.2,) * 3, position=(-0.15, 0, 0), boundary="sticky", end=0.08,
+            motion=[{"time": 1.0, "translation": (0.5, 0, 0)}],
+        ),
+    )  # fmt: skip
+    model = block(
+        velocity=(0.0, 0.0, -1.0), gravity=GRAVITY, colliders=colliders,
+        mpm=MpmSettings(domain=((-0.4,) * 3, (0.8,) * 3)),
+    )  # fmt: skip
+    ids = np.arange(100, dtype=np.int32)
+    return dataclasses.replace(
+        model,
+        holds=(Hold(ids, motion(shift=(0.0, 0.0, -0.1)), start=0.02, release=0.06),),
+        loads=(Force(ids, np.ones((100, 3)), end=0.05), Impulse(ids, 0.01 * np.ones((100, 3)), time=0.07)),
+    )
+
+
+def test_thread_count_and_restart_do_not_change_a_byte(restore_threads: None) -> None:
+    results = []
+    for threads in (1, 2, 8):
+        devices.set_thread_count(threads)
+        solver = SolverMPM(tumbling())
+        for k in range(6):
+            if k == 3 and threads == 2:
+                state = solver.state_dict()
+                solver = SolverMPM(tumbling())
+                solver.load_state_dict(state)
+            solver.step(1 / 60)
+        results.append({name: value.tobytes() for name, value in solver.state_dict().items()})
+    assert results[0] == results[1] == results[2]
+
+
+# -- Bad input
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"kind": "plane", "mass": 1.0},
+        {"kind": "sphere", "radius": 0.1, "mass": 0.0},
+        {"kind": "sphere", "radius": 0.1, "mass": 1.0, "motion": [{"time": 1.0}]},
+        {"kind": "sphere", "radius": 0.1, "velocity": (1.0, 0.0, 0.0)},
+        {"kind": "sphere", "radius": 0.1, "start": 1.0, "end": 0.5},
+        {"kind": "sphere", "radius": 0.1, "boundary": "bouncy"},
+    ],
+)
+def test_wrong_options_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        collider(**options)
+
+
+def test_fem_refuses_what_only_mpm_knows() -> None:
+    vertices, tets = tet_box((1, 1, 1), (0.1,) * 3, (0.0, 0.0, 1.0))
+    model = make_model(vertices, tets)
+    for options in ({"boundary": "sticky"}, {"mass": 1.0}, {"end": 1.0}):
+        ball = collider(kind="sphere", radius=0.1, name="ball", **options)
+        with pytest.raises(SolverError, match=f"collider 'ball'.*{next(iter(options))}"):
+            SolverFEM(dataclasses.replace(model, colliders=(ball,)))
+    with pytest.raises(SolverError, match="boundary"):
+        SolverFEM(dataclasses.replace(model, ground=Ground(boundary="slip")))
+
+
+def test_a_thin_collider_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    shelf = collider(kind="box", name="shelf", size=(1.0, 1.0, 0.05), position=(0.0, 0.0, -0.1))
+    SolverMPM(block(colliders=(shelf,))).step(1e-3)
+    assert "'shelf' is 0.05 m thick" in caplog.text
