@@ -1,4 +1,4 @@
-"""Problems with known answers: `gdpro verify fem`."""
+"""Problems with known answers: `gdpro verify fem`, `gdpro verify mpm`."""
 
 from __future__ import annotations
 
@@ -34,6 +34,34 @@ def fem(
     """Elements, materials, beams, vibrations, energy, contact, friction, robustness of the FEM solver."""
     setup(quiet, debug)
     _verify("fem", only or [], listing, quick, json_output, quiet)
+
+
+@verify.command()
+def mpm(
+    only: Only = None,
+    listing: Listing = False,
+    quick: Quick = False,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Materials, transfers, momenta, vibration, impact, fluids, sand, friction, reproducibility of MPM."""
+    setup(quiet, debug)
+    _verify("mpm", only or [], listing, quick, json_output, quiet)
+
+
+@verify.command()
+def mujoco(
+    only: Only = None,
+    listing: Listing = False,
+    quick: Quick = False,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Inertia, friction, restitution, hinges, rest, flexes and exact states in MuJoCo."""
+    setup(quiet, debug)
+    _verify("mujoco", only or [], listing, quick, json_output, quiet)
 
 
 def _verify(solver: str, only: list[str], listing: bool, quick: bool, json_output: bool, quiet: bool) -> None:

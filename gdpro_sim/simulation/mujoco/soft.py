@@ -19,7 +19,7 @@ LEAST_NODE = 1e-3
 """A node of a grid has at least this share of the mean node's mass: the body may not reach it."""
 
 LIGHT = 0.3
-"""A node of less than this share of the mean goes with another: it would flutter."""
+"""A node with less than this share of what a full grid would give it goes with another: it would flutter."""
 
 HELD = 0.5
 """A node is held where pinned vertices make up this share of what it carries."""
@@ -132,12 +132,28 @@ def _leaders(body: SoftBody, positions: np.ndarray, masses: np.ndarray, held: np
 
     MuJoCo lets nothing move by itself that has no elasticity.
     """
-    free = ~held & _reached(body) & (masses > LIGHT * masses.mean())
+    share = masses / _even(body)
+    free = ~held & _reached(body) & (share > LIGHT * share.max())
     leader = np.arange(len(positions))
     loose = ~held & ~free
     if loose.any() and free.any():
         leader[loose] = np.flatnonzero(free)[cKDTree(positions[free]).query(positions[loose])[1]]
     return leader
+
+
+def _even(body: SoftBody) -> np.ndarray:
+    """[n] masses of the nodes, in proportion, were the grid filled evenly."""
+    ends, middle = (0.5, 0.0) if body.reduction == "trilinear" else (2.0 / 15.0, 8.0 / 15.0)
+    axes = []
+    for cells in body.cells:
+        if body.reduction == "trilinear":
+            line = np.full(cells + 1, 2.0 * ends)
+        else:
+            line = np.full(2 * cells + 1, middle)
+            line[::2] = 2.0 * ends
+        line[[0, -1]] = ends
+        axes.append(line)
+    return np.einsum("i,j,k->ijk", *axes).ravel()
 
 
 def _reached(body: SoftBody) -> np.ndarray:

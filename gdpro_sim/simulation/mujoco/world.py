@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +18,8 @@ from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mujoco import rigid, soft
 from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, LEAST, add_pair, reference, set_contact
 from gdpro_sim.simulation.mujoco_model import MujocoWorld, RigidBody, Shape, SoftBody
+
+log = logging.getLogger(__name__)
 
 HEAVY = 1e6
 """A moved obstacle weighs so many times what all bodies weigh: contact does not turn it from its way."""
@@ -96,7 +100,12 @@ def build(model: Model) -> World:
 def compile_spec(spec: mujoco.MjSpec, where: str = "the scene") -> mujoco.MjModel:
     """Raises SceneError with MuJoCo's own message."""
     try:
-        return spec.compile()
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            compiled = spec.compile()
+        for item in said:
+            log.debug("%s: %s", where, " ".join(str(item.message).split()))
+        return compiled
     except (ValueError, mujoco.FatalError) as error:
         raise SceneError(f"{where}: MuJoCo cannot compile it: {' '.join(str(error).split())}") from None
 
