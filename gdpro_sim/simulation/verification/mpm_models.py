@@ -1,7 +1,7 @@
 """Particles in boxes and discs, and models of them for the MPM problems.
 
-Problems in a plane are one cell thick. A sheet of particles in the middle of the cell meets two sheets of
-nodes alike; between walls of a `domain` one cell apart its strain is plane, without walls its stress is.
+Problems in a plane are one cell thick, two particles deep: between smooth walls of a `domain` one cell apart
+strain is plane, without walls stress is.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from gdpro_sim.kernels import mpm_laws
 from gdpro_sim.kernels import particles as rows
 from gdpro_sim.materials import Material
 from gdpro_sim.simulation.colliders import Collider
+from gdpro_sim.simulation.conditions import Hold, Motion
 from gdpro_sim.simulation.model import Ground, Model, MpmSettings, Particles
 from gdpro_sim.simulation.mpm import SolverMPM
 from gdpro_sim.simulation.mpm.matter import Matter
@@ -56,10 +57,9 @@ def box(size: Triple, spacing: float, origin: Triple = (0.0, 0.0, 0.0)) -> Point
     return lattice(size, (x, y, z), origin)
 
 
-def sheet(width: float, height: float, dx: float, per_cell: int = 2) -> Points:
-    """A rectangle from the origin along x and z in the middle of the cell 0 < y < `dx`."""
-    counts = (round(per_cell * width / dx), 1, round(per_cell * height / dx))
-    return lattice((width, dx, height), counts)
+def sheet(width: float, height: float, dx: float) -> Points:
+    """A rectangle from the origin along x and z that fills 0 < y < `dx`, 8 particles a cell."""
+    return box((width, dx, height), 0.5 * dx)
 
 
 def disc(radius: float, dx: float, layers: int = 2) -> Points:
@@ -93,6 +93,7 @@ def make_model(
     gravity: Triple = (0.0, 0.0, 0.0),
     ground: Ground | None = None,
     colliders: tuple[Collider, ...] = (),
+    holds: tuple[Hold, ...] = (),
     **settings: Any,
 ) -> Model:
     """A model of particles without bodies (they only matter to the surface); no gravity unless it is given.
@@ -118,13 +119,25 @@ def make_model(
         gravity=gravity,
         ground=ground,
         colliders=colliders,
+        holds=holds,
         mpm=MpmSettings(grid_spacing=dx, **settings),
     )
 
 
-def between_walls(dx: float, size: float = 1e3) -> tuple[Triple, Triple]:
-    """The `domain` that keeps a `sheet` plane, and nothing else in."""
-    return (-size, 0.0, -size), (size, dx, size)
+def between_walls(dx: float, left: float = -1e3, right: float = 1e3) -> tuple[Triple, Triple]:
+    """The `domain` that keeps a `sheet` plane, open above and below; m."""
+    return (left, 0.0, -1e3), (right, dx, 1e3)
+
+
+def plate(height: float, *, up: bool, speed: float = 0.0, **options: Any) -> Collider:
+    """Solid below z = `height` (`up`) or above it; moves along z at `speed` m/s."""
+    motion = None
+    if speed:
+        path = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e3 * speed]])
+        motion = Motion(np.zeros(0, np.int32), np.zeros(3), np.array([0.0, 1e3]), path, np.zeros((2, 3)))
+    turn = np.eye(3) if up else np.diag([1.0, -1.0, -1.0])
+    place = np.array([0.0, 0.0, height])
+    return Collider("plate", "plane", position=place, rotation=turn, motion=motion, **options)
 
 
 def spinning(points: Points, rate: Triple) -> np.ndarray:
@@ -137,6 +150,11 @@ def mechanical_energy(solver: SolverMPM) -> float:
     """Kinetic and elastic, J."""
     d = solver.diagnostics()
     return d.kinetic_energy + d.elastic_energy
+
+
+def total_energy(solver: SolverMPM) -> float:
+    """The same and that of gravity, J."""
+    return mechanical_energy(solver) + solver.diagnostics().gravity_energy
 
 
 def field(solver: SolverMPM, row: int, count: int = 1) -> np.ndarray:
