@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import typer
 
-from gdpro_sim.cli.verify import fem
+from gdpro_sim.cli.verify import fem, mpm
 from gdpro_sim.errors import RequestError, SolverError
 from gdpro_sim.simulation.verification import SOLVERS, problems
 from gdpro_sim.simulation.verification import fem as suite
@@ -31,11 +31,15 @@ from gdpro_sim.simulation.verification.framework import (
 from gdpro_sim.simulation.verification.models import tet_ball, uneven_box
 from gdpro_sim.simulation.verification.reference import ReferenceFem
 
-ALL = [item for solver in SOLVERS for item in problems(solver)]
+ALL = [(solver, item) for solver in SOLVERS for item in problems(solver)]
 
 
 @pytest.mark.parametrize(
-    "item", [pytest.param(p, id=p.name, marks=[pytest.mark.slow] if p.slow else []) for p in ALL]
+    "item",
+    [
+        pytest.param(p, id=f"{solver}-{p.name}", marks=[pytest.mark.slow] if p.slow else [])
+        for solver, p in ALL
+    ],
 )
 def test_known_answers(item: Problem) -> None:
     result = run_problem(item)
@@ -48,7 +52,7 @@ def test_names_are_unique_and_sources_given() -> None:
     for solver in SOLVERS:
         names = [item.name for item in problems(solver)]
         assert len(set(names)) == len(names)
-    assert all(item.title and item.source for item in ALL)
+    assert all(item.title and item.source for _, item in ALL)
 
 
 @pytest.mark.parametrize(
@@ -140,6 +144,14 @@ def test_the_command_lists_and_speaks_json(capsys: pytest.CaptureFixture[str]) -
     summary = json.loads(capsys.readouterr().out)
     assert summary["passed"] and list(summary["problems"]) == ["patch"]
     assert {"quantity", "expected", "measured", "error", "bound", "passed"} <= set(summary["checks"][0])
+
+
+def test_the_command_takes_mpm(capsys: pytest.CaptureFixture[str]) -> None:
+    mpm(listing=True)
+    listed = capsys.readouterr().out
+    assert "dam-break" in listed and "(slow)" in listed
+    mpm(only=["fluid"])
+    assert "Monaghan 1994" in capsys.readouterr().out
 
 
 def test_the_command_fails_where_a_problem_fails(
