@@ -15,7 +15,7 @@ from gdpro_sim.asset.from_mesh import bind_mesh
 from gdpro_sim.asset.from_splats import bind_splats
 from gdpro_sim.binding import BoundGaussians, sh_basis
 from gdpro_sim.device import set_thread_count, thread_count
-from gdpro_sim.errors import AssetError, SolverError
+from gdpro_sim.errors import AssetError, MeshError, SolverError
 from gdpro_sim.gaussians import Gaussians, rotation_matrices
 from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.kernels.mpm_look import bound_deformations
@@ -193,7 +193,7 @@ def test_unwelding_keeps_every_gaussian(torn: tuple[BoundGaussians, Filling, Unw
     grains = after.means[n:].numpy()
     assert parts.grains == len(grains) > 100
     depth = np.minimum(0.1 - np.abs(grains[:, 1:]).max(1), 0.5 - np.abs(grains[:, 0]))
-    assert (depth >= 1.99 * after.scales[n:, 0].numpy()).all(), "no grain shows at rest"
+    assert (depth >= 2.99 * after.scales[n:, 0].numpy()).all(), "no grain shows at rest"
     # Interior colours are those of the surface around them.
     left = grains[:, 0] < -0.1
     assert (after.sh[n:, 0, 0].numpy()[left] > 0.9).all() and (after.sh[n:, 0, 2].numpy()[left] < 0.1).all()
@@ -218,7 +218,7 @@ def test_rest_looks_as_before(torn: tuple[BoundGaussians, Filling, Unwelded]) ->
     renderer = Renderer(camera, Studio(ground=-0.1))
     pictures = [renderer.render(b.gaussians(), b.normals()).astype(float) for b in (bound, parts.gaussians)]
     error = np.mean((pictures[0] - pictures[1]) ** 2)
-    assert 10.0 * np.log10(255.0**2 / max(error, 1e-12)) > 45.0
+    assert 10.0 * np.log10(255.0**2 / max(error, 1e-12)) > 50.0
 
 
 def test_a_patch_turns_covariance_and_colour(torn: tuple[BoundGaussians, Filling, Unwelded]) -> None:
@@ -291,6 +291,10 @@ def test_wrong_arguments_are_refused() -> None:
         Look(corners, point, patches=np.array([1, 0, 0]))
     with pytest.raises(SolverError, match="over 2 particles"):
         Look(corners, point).surface(point[:1], identity(1))
+    bound, _ = bar()
+    crumbs = Filling(point, np.full(2, 1e-12, np.float32))
+    with pytest.raises(MeshError, match=r"particles 0\.0001 m apart would cut .* 1,000,000 triangles"):
+        unweld(bound, crumbs)
 
 
 def test_a_cloud_keeps_its_gaussians() -> None:
