@@ -16,6 +16,7 @@ from gdpro_sim.kernels import mpm_stiffness
 from gdpro_sim.kernels import particles as rows
 from gdpro_sim.materials import Material
 from gdpro_sim.simulation.colliders import Collider
+from gdpro_sim.simulation.conditions import Hold
 from gdpro_sim.simulation.model import Diagnostics, Ground, Model, MpmSettings, Particles
 from gdpro_sim.simulation.mpm.implicit import GridNewton
 from gdpro_sim.simulation.mpm.solver import SolverMPM
@@ -176,6 +177,24 @@ def test_tiles_and_single_particles_agree(kernel: str) -> None:
     close(more.numpy()[:, :3], newton._off_diagonal.numpy()[:, :3])
 
 
+def test_a_step_one_particle_at_a_time_is_the_same() -> None:
+    """What a GPU does."""
+    devices.set_thread_count(1)
+    found = []
+    for tiled in (True, False):
+        particles = bar((6, 6, 6), (0.3, 0.3, 0.3), young=1e6)
+        particles.velocities[:] = (0.5, 0.0, -1.0)
+        solver = solver_of(particles, ground=Ground())
+        assert solver._newton is not None
+        solver._newton.tiled = tiled
+        for _ in range(3):
+            solver.step(1 / 60)
+        assert solver.diagnostics().converged
+        found.append((solver.positions, solver.velocities))
+    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=0, atol=5e-3)
+
+
 def mode(particles: Particles, length: float) -> np.ndarray:
     """First axial mode of a free bar."""
     return np.cos(math.pi * particles.positions[:, 0] / length)
@@ -225,8 +244,8 @@ def test_a_column_sags_by_its_weight(law: str) -> None:
     particles = bar((5, 5, 15), (0.2, 0.2, 0.6), poisson=0.0, model=law, young=2e5, rayleigh_mass=8.0)
     ground = Ground(boundary="slip")
     solver = solver_of(particles, ground=ground)
-    for _ in range(40):
-        solver.step(1 / 30)
+    for _ in range(25):
+        solver.step(1 / 20)
     found = solver.diagnostics()
     assert found.converged and found.kinetic_energy < 1e-6
     theory = (1000.0 * 9.81) ** 2 * 0.04 * 0.6**3 / (6.0 * 2e5)
@@ -234,8 +253,8 @@ def test_a_column_sags_by_its_weight(law: str) -> None:
     if law != "stable_neo_hookean":
         return
     explicit = solver_of(particles, {"integrator": "explicit"}, ground=ground)
-    for _ in range(60):
-        explicit.step(1 / 30)
+    for _ in range(40):
+        explicit.step(1 / 20)
     assert math.isclose(found.elastic_energy, explicit.diagnostics().elastic_energy, rel_tol=0.02)
     np.testing.assert_allclose(solver.positions, explicit.positions, rtol=0, atol=1e-3)
 
@@ -295,10 +314,10 @@ def test_the_same_bytes_for_any_number_of_threads() -> None:
     found = []
     for threads in (1, 2, 8):
         devices.set_thread_count(threads)
-        particles = bar((12, 12, 12), (0.5, 0.5, 0.5), young=1e6)
+        particles = bar((9, 9, 9), (0.45, 0.45, 0.45), young=1e6)
         particles.velocities[:] = (1.0, 0.0, -2.0)
-        solver = solver_of(particles, ground=Ground(height=0.0))
-        for _ in range(3):
+        solver = solver_of(particles, ground=Ground())
+        for _ in range(2):
             solver.step(1 / 60)
         found.append(solver.state_dict())
     for other in found[1:]:
@@ -322,23 +341,23 @@ def test_a_saved_state_goes_on_to_the_same_bytes() -> None:
 
 @pytest.mark.parametrize("young", [1e5, 1e8])
 def test_a_block_comes_to_rest_on_the_floor(young: float) -> None:
-    particles = bar((8, 8, 8), (0.4, 0.4, 0.4), young=young)
-    particles.positions[:, 2] += 0.05
+    particles = bar((6, 6, 6), (0.3, 0.3, 0.3), young=young)
+    particles.positions[:, 2] += 0.02
     solver = solver_of(particles, ground=Ground())
-    for _ in range(60):
+    for _ in range(40):
         solver.step(1 / 60)
         assert solver.diagnostics().converged
     found = solver.diagnostics()
     assert found.kinetic_energy < 1e-3
-    sag = 1000.0 * 9.81 * 0.4**2 / (2.0 * young)
-    assert abs(solver.positions[:, 2].mean() - (0.2 - 0.5 * sag)) < 0.2 * sag + 2e-3
+    sag = 1000.0 * 9.81 * 0.3**2 / (2.0 * young)
+    assert abs(solver.positions[:, 2].mean() - (0.15 - 0.5 * sag)) < 0.2 * sag + 2e-3
 
 
 @pytest.mark.parametrize("degrees", [10.0, 30.0])
 def test_a_block_slides_where_friction_lets_it(degrees: float) -> None:
     """x = g (sin a - mu cos a) t^2 / 2 past the angle of friction, nothing below."""
     angle, mu, time = math.radians(degrees), 0.3, 0.4
-    particles = bar((12, 8, 6), (0.6, 0.4, 0.3), young=1e7, friction=mu)
+    particles = bar((8, 6, 4), (0.4, 0.3, 0.2), young=1e7, friction=mu)
     gravity = (9.81 * math.sin(angle), 0.0, -9.81 * math.cos(angle))
     solver = solver_of(particles, gravity=gravity, ground=Ground())
     start = solver.positions[:, 0].mean()
@@ -348,6 +367,22 @@ def test_a_block_slides_where_friction_lets_it(degrees: float) -> None:
     expected = max(0.0, 0.5 * 9.81 * (math.sin(angle) - mu * math.cos(angle)) * time**2)
     # Backward Euler with v first: the sum over steps is longer by half a step.
     assert abs(solver.positions[:, 0].mean() - start - expected) < 0.05 * expected + 1e-3
+
+
+def test_a_held_cantilever_droops_as_it_does_explicitly() -> None:
+    particles = bar((16, 4, 4), (0.8, 0.2, 0.2), young=1e6, rayleigh_mass=8.0)
+    held = np.flatnonzero(particles.positions[:, 0] < 0.1).astype(np.int32)
+    tip = particles.positions[:, 0] > 0.75
+    found = []
+    for integrator, steps in (("implicit", 30), ("explicit", 50)):
+        solver = solver_of(particles, {"integrator": integrator}, holds=(Hold(held, None),))
+        for _ in range(steps):
+            solver.step(1 / 20)
+        assert solver.diagnostics().converged
+        np.testing.assert_allclose(solver.positions[held], particles.positions[held], rtol=0, atol=1e-6)
+        found.append(float((particles.positions[tip, 2] - solver.positions[tip, 2]).mean()))
+    assert math.isclose(found[0], found[1], rel_tol=0.06)
+    assert found[0] > 0.05
 
 
 def test_what_cannot_be_done_is_said() -> None:
@@ -361,7 +396,7 @@ def test_what_cannot_be_done_is_said() -> None:
 
 
 def test_too_few_iterations_are_reported() -> None:
-    particles = bar((8, 8, 8), (0.4, 0.4, 0.4), young=1e6)
+    particles = bar((5, 5, 5), (0.25, 0.25, 0.25), young=1e6)
     particles.velocities[:, 0] = np.sin(20.0 * particles.positions[:, 0])
     solver = solver_of(particles, {"cg_iterations": 1, "newton_iterations": 2}, gravity=(0.0, 0.0, 0.0))
     solver.step(1 / 60)

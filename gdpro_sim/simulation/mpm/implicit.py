@@ -45,6 +45,8 @@ class Outcome(NamedTuple):
 class GridNewton:
     """Finds the grid's velocities at the end of a substep; see `gdpro_sim.kernels.mpm_implicit`.
 
+    tiled: whether particles meet the grid in tiles, as on a CPU, or one by one
+
     Memory grows with the grid and is kept. Raises SolverError for materials that flow or tear, and for
     colliders with a mass.
     """
@@ -69,7 +71,8 @@ class GridNewton:
         self._mass = float(volumes @ densities[particles.matter])
         self._full = float(densities[particles.matter].max()) * grid.spacing**3
         device, stride = grid.device, grid.particles.shape[1]
-        self.per = 64 if device == "cpu" else 1
+        self.tiled = device == "cpu"
+        self._values: wp.array | None = None
         self.work = wp.zeros((int(mpm_implicit.WORK), stride), dtype=float, device=device)
         self._energies = wp.zeros(len(particles), dtype=wp.float64, device=device)
         self._sums, self._more_sums = (wp.zeros(RANGES, dtype=wp.float64, device=device) for _ in range(2))
@@ -77,7 +80,6 @@ class GridNewton:
         self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
         self._tolerance = wp.full(1, settings.cg_tolerance, dtype=wp.float64, device=device)
         self._projectors = wp.zeros(0, dtype=wp.mat33, device=device)
-        self._values: wp.array | None = None
 
     def _reserve(self) -> None:
         """Arrays over the nodes, after the grid has changed."""
@@ -98,9 +100,10 @@ class GridNewton:
             self._projectors = grid.array("implicit.projectors", nodes, wp.mat33)
             self._unbounded, self._bounded, self._held = map(vector, ("unbounded", "bounded", "held"))
         self._inverse = grid.array("implicit.inverse", nodes, wp.mat33)
-        self._indices = nodes // self.per
+        self._per = 64 if self.tiled else 1
+        self._indices = nodes // self._per
         self._dots = grid.array("implicit.dots", self._indices, wp.float64)
-        if grid.device == "cpu":
+        if self.tiled:
             self._more_tiles = grid.array("implicit.more_tiles", len(grid.tiles), wp.vec4)
         self._transfer = [grid.width, grid.spacing]
 
@@ -202,7 +205,7 @@ class GridNewton:
     def energy(self, h: float) -> float:
         """E in J; infinite where a particle is turned inside out. Leaves velocity gradients in `work`."""
         grid = self.grid
-        if grid.device == "cpu":
+        if self.tiled:
             self._over_blocks(
                 mpm_stiffness.gradient_blocks,
                 [grid.starts, grid.coords, grid.neighbors, grid.values, grid.particles],
@@ -229,7 +232,7 @@ class GridNewton:
             [self.work],
             minimum=256,
         )
-        if grid.device == "cpu":
+        if self.tiled:
             common = [grid.starts, grid.coords, grid.particles, self.work]
             self._over_blocks(mpm_stiffness.moment_blocks, common, [grid.tiles])
             self._add_tiles(grid.tiles, self._force)
@@ -259,7 +262,7 @@ class GridNewton:
     def multiply(self, p: wp.array, q: wp.array) -> None:
         """q = Hessian of E times p, in free directions."""
         grid = self.grid
-        if grid.device == "cpu":
+        if self.tiled:
             self._over_blocks(
                 mpm_stiffness.product_blocks,
                 [grid.starts, grid.coords, grid.neighbors, p, grid.particles, self.work],
@@ -289,7 +292,7 @@ class GridNewton:
             [self._step, self._residual, self._z, self._p, self._dots],
         )
         self._scalar(linalg.cg_begin)
-        check_every = 1 if self.grid.device == "cpu" else CUDA_CHECK_EVERY
+        check_every = 1 if self.tiled else CUDA_CHECK_EVERY
         for iteration in range(self.settings.cg_iterations):
             if iteration % check_every == 0 and self._scalars.numpy()[linalg.CG_DONE] != 0.0:
                 break
@@ -389,8 +392,8 @@ class GridNewton:
 
     def _reduce(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
         """A kernel with partial sums."""
-        minimum = 64 if self.per > 1 else 4096
-        self.grid.launch(kernel, self._indices, [self.per, *inputs], outputs, minimum=minimum)
+        minimum = 64 if self.tiled else 4096
+        self.grid.launch(kernel, self._indices, [self._per, *inputs], outputs, minimum=minimum)
 
     def _add_tiles(self, tiles: wp.array, out: wp.array) -> None:
         grid = self.grid
@@ -399,7 +402,7 @@ class GridNewton:
     def _scalar(self, kernel: wp.Kernel) -> None:
         """One of the scalar steps of conjugate gradients, over the partial sums of the phase before it."""
         launch, dots, count = self.grid.launch, self._dots, self._indices
-        if self.grid.device != "cpu":
+        if not self.tiled:
             launch(linalg.sum_ranges, RANGES, [count, RANGES, dots], [self._sums])
             dots, count = self._sums, RANGES
         launch(kernel, 1, [count, dots, self._tolerance], [self._scalars])
