@@ -19,7 +19,7 @@ LEAST_NODE = 1e-3
 """A node of a grid has at least this share of the mean node's mass: the body may not reach it."""
 
 LIGHT = 0.3
-"""A node with less than this share of what a full grid would give it goes with another: it would flutter."""
+"""A node whose cells are all less full than this goes with another: it would flutter."""
 
 HELD = 0.5
 """A node is held where pinned vertices make up this share of what it carries."""
@@ -49,7 +49,7 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
     if body.reduction != "full":
         positions, weights = grid(body)
         masses, held, driver = _of_nodes(body, weights, held, driver)
-        leader = _leaders(body, positions, masses, held)
+        leader = _leaders(body, positions, held)
         masses = np.bincount(leader, weights=masses, minlength=len(masses))
     for k in range(len(body.motions)):
         mover = spec.worldbody.add_body(name=f"{name}_pin{k}", mocap=True)
@@ -127,13 +127,12 @@ def _box(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
     return first * unit, (first + step * intervals) * unit
 
 
-def _leaders(body: SoftBody, positions: np.ndarray, masses: np.ndarray, held: np.ndarray) -> np.ndarray:
+def _leaders(body: SoftBody, positions: np.ndarray, held: np.ndarray) -> np.ndarray:
     """[n] the node that each goes with: itself, or the nearest free one where the body does not reach it.
 
-    MuJoCo lets nothing move by itself that has no elasticity.
+    MuJoCo lets nothing move by itself that has no elasticity, and what has little flutters.
     """
-    share = masses / _even(body)
-    free = ~held & _reached(body) & (share > LIGHT * share.max())
+    free = ~held & (_filling(body) > LIGHT)
     leader = np.arange(len(positions))
     loose = ~held & ~free
     if loose.any() and free.any():
@@ -141,30 +140,19 @@ def _leaders(body: SoftBody, positions: np.ndarray, masses: np.ndarray, held: np
     return leader
 
 
-def _even(body: SoftBody) -> np.ndarray:
-    """[n] masses of the nodes, in proportion, were the grid filled evenly."""
-    ends, middle = (0.5, 0.0) if body.reduction == "trilinear" else (2.0 / 15.0, 8.0 / 15.0)
-    axes = []
-    for cells in body.cells:
-        if body.reduction == "trilinear":
-            line = np.full(cells + 1, 2.0 * ends)
-        else:
-            line = np.full(2 * cells + 1, middle)
-            line[::2] = 2.0 * ends
-        line[[0, -1]] = ends
-        axes.append(line)
-    return np.einsum("i,j,k->ijk", *axes).ravel()
-
-
-def _reached(body: SoftBody) -> np.ndarray:
-    """Nodes [n] bool of cells that hold the middle of a tet."""
+def _filling(body: SoftBody) -> np.ndarray:
+    """[n] of each node: how full of tets the fullest of its cells is, 1 being full."""
     low, high = _box(body)
     cells, order = np.asarray(body.cells), 1 if body.reduction == "trilinear" else 2
-    middles = body.vertices[body.tets].mean(axis=1)
-    at = np.clip(((middles - low) / (high - low) * cells).astype(int), 0, cells - 1)
-    found = np.zeros(order * cells + 1, bool)
-    for i, j, k in np.unique(at, axis=0) * order:
-        found[i : i + order + 1, j : j + order + 1, k : k + order + 1] = True
+    corners = body.vertices[body.tets]
+    at = np.clip(((corners.mean(axis=1) - low) / (high - low) * cells).astype(int), 0, cells - 1)
+    volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+    full = np.zeros(cells)
+    np.add.at(full, tuple(at.T), volumes / ((high - low) / cells).prod())
+    found = np.zeros(order * cells + 1)
+    for i, j, k in np.argwhere(full > 0.0):
+        x, y, z = (slice(order * c, order * c + order + 1) for c in (i, j, k))
+        found[x, y, z] = np.maximum(found[x, y, z], full[i, j, k])
     return found.ravel()
 
 

@@ -13,7 +13,6 @@ from gdpro_sim.simulation.verification.models import make_model, tet_box
 from gdpro_sim.simulation.verification.mujoco_models import DENSITY, flex, world
 
 FRAME = 1.0 / 30.0
-BEAM = Beam(1.0, 0.2, 1e6, 0.3, DENSITY)
 
 
 def _cantilever(seconds: float, young: float, **options: Any) -> float:
@@ -51,7 +50,7 @@ def cantilever() -> Iterator[Check]:
     yield relative("full flex, 240 tets: sag", sag, _cantilever(2.0, 1e7), 0.01, "m")
     stiff = Beam(1.0, 0.2, 1e7, 0.3, DENSITY)
     found = _cantilever(2.0, 1e7, reduction="quadratic", cells=(5, 1, 1))
-    yield relative("quadratic grid of 5 x 1 x 1 cells: sag", stiff.sag(), found, 0.03, "m")
+    yield relative("quadratic grid of 5 x 1 x 1 cells: sag", stiff.sag(), found, 0.05, "m")
 
 
 @problem(
