@@ -506,7 +506,6 @@ def meet_obstacles(
         value = values_out[64 * block + n]
         mass = value[3]
         if mass > 0.0:
-            x = node_position(blocks[block], n, spacing)
             v = wp.vec3(value[0], value[1], value[2])
             before = v
             for _sweep in range(SWEEPS):
@@ -518,6 +517,7 @@ def meet_obstacles(
                     kind = int(table[c, KIND])
                     open = gap[64 * pair + n]
                     if open < FAR and kind != ABSENT:
+                        x = node_position(blocks[block], n, spacing)
                         normal = wp.vec3(f[0], f[1], f[2])
                         allowed = closing_speed(open, kind, h, float(spacing)) * normal
                         u = obstacle_velocity(table, c, x) - allowed

@@ -2,8 +2,9 @@
 
 Nodes in an obstacle, and those right outside, cannot move matter into it: it sticks, slips, or leaves and
 rubs, see `gdpro_sim.kernels.mpm_boundary`. What is held back is the surface of the particles, half their
-spacing from their middles. An obstacle thinner than two cells may have too few nodes to keep matter out: the
-log says which.
+spacing from their middles. Where they overlap all the same, matter is pushed out slowly. Two limits: an obstacle
+thinner than two cells may have too few nodes to keep matter out (the log says which), and one that comes nearer
+by more than 0.4 cells in a substep overlaps matter before it pushes.
 """
 
 from __future__ import annotations

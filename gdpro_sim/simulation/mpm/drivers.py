@@ -8,6 +8,7 @@ import warp as wp
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import mpm_boundary as kernels
 from gdpro_sim.kernels import mpm_drivers
+from gdpro_sim.kernels.particles import POSITION
 from gdpro_sim.simulation.conditions import Force, Impulse, pose_at
 from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mpm.grid import OFFSETS, Grid
@@ -104,7 +105,7 @@ class Holds:
         """Find the blocks of the grid that each held particle reaches before the next sort."""
         assert self._places.place is not None
         place = self._places.place.numpy()[self._particles]
-        rows = grid.particles[:3].numpy()[:, place] / np.float32(grid.spacing)
+        rows = grid.particles[POSITION : POSITION + 3].numpy()[:, place] / np.float32(grid.spacing)
         owner = grid.owners.numpy()[place]
         first = np.floor(rows - 0.5 if grid.width == 3 else rows - 1.0).astype(np.int64).T
         local = first - 4 * grid.coords.numpy()[owner]
