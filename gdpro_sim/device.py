@@ -9,6 +9,7 @@ must write memory no other index writes (plain Warp atomics are not atomic on th
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import sys
 import tempfile
@@ -280,7 +281,7 @@ class _Recorded:
     def __init__(self, kernel: wp.Kernel, arguments: list[Any], device: str) -> None:
         self._kernel, self._arguments, self._device = kernel, arguments, device
         self._places = [k for k, argument in enumerate(arguments) if not _is_held(argument)]
-        self._commands: dict[tuple[int, int], tuple[wp.Launch, list[Any]]] = {}
+        self._commands: dict[tuple[int, int], tuple[_Command, list[Any]]] = {}
 
     def launch(self, begin: int, end: int, numbers: list[Any]) -> None:
         """`numbers` are the arguments that are no arrays or structs, in order."""
@@ -289,21 +290,57 @@ class _Recorded:
             arguments = list(self._arguments)
             for place, number in zip(self._places, numbers, strict=True):
                 arguments[place] = number
-            command = wp.launch(
-                self._kernel,
-                dim=end - begin,
-                inputs=[begin, *arguments],
-                device=self._device,
-                record_cmd=True,
+            command = _Command(
+                wp.launch(
+                    self._kernel,
+                    dim=end - begin,
+                    inputs=[begin, *arguments],
+                    device=self._device,
+                    record_cmd=True,
+                )
             )
             self._commands[begin, end] = (command, list(numbers))
         else:
             command, known = found
             for k, number in enumerate(numbers):
                 if known[k] is not number and known[k] != number:
-                    command.set_param_at_index(self._places[k] + 1, number)
+                    command.put(self._places[k] + 1, number)
                     known[k] = number
         command.launch()
+
+
+class _Command:
+    """A recorded launch. On a CPU its arguments lie side by side in memory, as the kernel takes them.
+
+    `wp.Launch.launch` puts them there anew at every launch, which takes longer than a small kernel runs.
+    """
+
+    def __init__(self, command: wp.Launch) -> None:
+        self._command = command
+        self._direct = command.device.is_cpu and command.block_dim <= 1
+        if not self._direct:
+            return
+        arguments = command.kernel.adj.args
+        bounds, *params = command.params
+        self._names = [argument.label for argument in arguments]
+        fields = [(name, type(param)) for name, param in zip(self._names, params, strict=True)]
+        self._arguments = type("Arguments", (ctypes.Structure,), {"_fields_": fields})()
+        for name, param in zip(self._names, params, strict=True):
+            setattr(self._arguments, name, param)
+        self._call = command.hooks.forward
+        self._where = ctypes.byref(bounds), ctypes.byref(self._arguments)
+
+    def put(self, index: int, value: Any) -> None:
+        """Give argument number `index` another value."""
+        self._command.set_param_at_index(index, value)
+        if self._direct:
+            setattr(self._arguments, self._names[index], self._command.params[index + 1])
+
+    def launch(self) -> None:
+        if self._direct:
+            self._call(*self._where)
+        else:
+            self._command.launch()
 
 
 __all__ = [

@@ -34,6 +34,9 @@ def _row_length(count: int) -> int:
 FARTHEST = 1 << 21
 """Cells from the origin at which float32 tells no eighth of a cell apart any more."""
 
+FEW_BLOCKS = 16
+"""Blocks of particles worth a range of their own among threads."""
+
 WIDTHS = {"quadratic": 3, "cubic": 4}
 
 
@@ -66,8 +69,8 @@ class Grid:
         shape = (len(particles), _row_length(count))
         self.particles, self._particles = (wp.zeros(shape, dtype=float, device=device) for _ in range(2))
         ids = np.arange(count, dtype=np.int32)
-        self.matter = wp.array(matter, dtype=int, device=device)
-        self.ids = wp.array(ids, dtype=int, device=device)
+        self.matter: wp.array = wp.array(matter, dtype=int, device=device)
+        self.ids: wp.array = wp.array(ids, dtype=int, device=device)
         self._keys: wp.array = wp.zeros(count, dtype=int, device=device)
         self.owners: wp.array = wp.zeros(count, dtype=int, device=device)
         self.count = self.occupied = 0
@@ -199,7 +202,7 @@ class Grid:
                 self.occupied,
                 [*common, self.starts, self.coords, self.particles],
                 [self.tiles],
-                minimum=4,
+                minimum=FEW_BLOCKS,
             )
             self.launch(
                 mpm_grid.sum_tiles,
@@ -234,7 +237,7 @@ class Grid:
                 self.occupied,
                 [*common, self.starts, self.coords, self.neighbors, self.change],
                 [self.particles],
-                minimum=4,
+                minimum=FEW_BLOCKS,
             )
         else:
             self.launch(
@@ -253,7 +256,7 @@ class Grid:
                 self.occupied,
                 [*common, self.starts, self.coords, self.neighbors, self.values],
                 [self.particles, self.strayed],
-                minimum=4,
+                minimum=FEW_BLOCKS,
             )
         else:
             self.launch(
