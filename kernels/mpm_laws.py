@@ -4,7 +4,7 @@
 velocity gradient C) and writes the Kirchhoff stress tau = J sigma times the volume at rest. With the singular
 values s of F, e = log s, J = det F, b = F F^T, and the energies of `gdpro_sim.kernels.elasticity`:
 
-    STABLE_NEO_HOOKEAN  tau = mu (b - 1) + J U'(J) + mu, U'(J) = (lambda + mu) (J - 1) - mu and the barrier
+    STABLE_NEO_HOOKEAN  tau = mu b + J U'(J), U'(J) = (lambda + mu) (J - 1) - mu and the barrier
     NEO_HOOKEAN         tau = mu (b - 1) + lambda log J
     COROTATED           tau_i = 2 mu s_i (s_i - 1) + lambda J (J - 1) and the barrier
     STVK_HENCKY         tau_i = 2 mu e_i + lambda tr e, within von Mises' limit, see
@@ -19,7 +19,8 @@ values s of F, e = log s, J = det F, b = F F^T, and the energies of `gdpro_sim.k
                         stress = yield + k rate^n, implicitly (Yue et al. 2015, "Continuum foam", ACM TOG
                         34(5); here in logarithmic strains, which keep volume exactly)
     FLUID               J alone resists: p = K / 7 (J^-7 - 1), no tension (Monaghan 1994, "Simulating free
-                        surface flows with SPH", JCP 110); Newtonian shear viscosity
+                        surface flows with SPH", JCP 110); Newtonian shear viscosity. J follows the
+                        velocity's divergence and, slowly, the grid's density where particles have clumped
 
 Plastic flow needs the eigenvectors Q of b alone, no singular value decomposition: F becomes
 Q diag(s_new / s) Q^T F.
@@ -90,6 +91,10 @@ FLAT = wp.constant(wp.float64(0.05))
 """Singular values of a recovered deformation gradient are at least this."""
 
 
+PACKING = (10.0, 0.02)
+"""Where a fluid's particles have clumped, J falls towards the grid's ratio of volumes and this much more, at
+this rate, 1/s: else J, which is integrated along the particles, would drift from where they are."""
+
 LOOSE = 0.05
 """A fluid that has come apart resists compression anew from this J - 1 on at the latest."""
 
@@ -106,7 +111,7 @@ _CONSTANTS = "".join(
             name: getattr(rows, name)
             for name in (
                 "VELOCITY", "AFFINE", "DEFORMATION", "DEFORMATION_LOW", "STRESS", "VOLUME", "SPEED",
-                "INTERNAL",
+                "INTERNAL", "DENSITY",
             )
         },
         "STABLE_NEO_HOOKEAN": STABLE_NEO_HOOKEAN,
@@ -495,9 +500,16 @@ _FLUID = """
         const F m2 = r[3] * r[7] - r[4] * r[6];
         const F growth = r[0] + r[4] + r[8] + (m0 + (r[0] * r[4] - r[1] * r[3]) + (r[0] * r[8] - r[2] * r[6]))
             + (r[0] * m0 - r[1] * m1 + r[2] * m2);
-        const F known = narrow(memory), after = known + (known + 1.0f) * growth;
+        const F known = narrow(memory);
+        F more = (known + 1.0f) * growth;
+        if (particles.shape[0] > DENSITY) {
+            const F packed = row(DENSITY) * constant(LIGHTNESS);
+            const F least = 1.0f / max_(packed, splat(0.1f)) - 1.0f + SPARE;
+            more += min_(least - known, zero) * min_(splat(h * PACKING), one);
+        }
+        const F after = known + more;
         const F bounded = max_(min_(after, splat(LOOSE)), splat(-0.7f));
-        change = select(fluid, select(bounded == after, (known + 1.0f) * growth, bounded - known), change);
+        change = select(fluid, select(bounded == after, more, bounded - known), change);
         const F p = max_(lam * (1.0f / 7.0f) * expm1_(-7.0f * log1p_(bounded)), zero);
         J = select(fluid, bounded + 1.0f, J);
         for (int i = 0; i < 3; ++i) tau[i] = select(fluid, -J * p, tau[i]);
@@ -547,6 +559,8 @@ _UPDATE = f"""
 {_GROUP}
 #define PRODUCT(v) (v[0] + v[1] + v[2] + v[0] * v[1] + v[0] * v[2] + v[1] * v[2] + v[0] * v[1] * v[2])
 #define LOOSE {LOOSE}f
+#define PACKING {PACKING[0]}f
+#define SPARE {PACKING[1]}f
 {LANE_MATH}
 {_BEGIN}
 {_PRINCIPAL}
@@ -554,6 +568,8 @@ _UPDATE = f"""
 {_END}
 #undef PRODUCT
 #undef LOOSE
+#undef PACKING
+#undef SPARE
 """
 
 
@@ -582,8 +598,9 @@ def update_stress(
     """The materials' answer to a substep of h seconds; with h = 0, to the deformation as it is.
 
     In: rows DEFORMATION (trial) and DEFORMATION_LOW, AFFINE (the velocity gradient), VELOCITY, VOLUME,
-    INTERNAL. Out: STRESS, SPEED, INTERNAL; DEFORMATION and its low part where matter flows; VELOCITY and
-    AFFINE under damping on mass. Indices are `groups`. `matter` [N] are rows of `table` [materials, COLUMNS].
+    INTERNAL, and DENSITY where there is one. Out: STRESS, SPEED, INTERNAL; DEFORMATION and its low part where
+    matter flows; VELOCITY and AFFINE under damping on mass. Indices are `groups`. `matter` [N] are rows of
+    `table` [materials, COLUMNS].
     """
     group = start + wp.tid()
     mask = degenerate_lanes(group, matter, particles_out)

@@ -28,6 +28,7 @@ from gdpro_sim.kernels.particles import (
     AFFINE,
     DEFORMATION,
     DEFORMATION_LOW,
+    DENSITY,
     MASS,
     POSITION,
     POSITION_LOW,
@@ -277,13 +278,15 @@ _GATHER_MOVE = """
                 add_to(DEFORMATION + 3 * i + j, DEFORMATION_LOW + 3 * i + j,
                     h * (C[3 * i] * a0 + C[3 * i + 1] * a1 + C[3 * i + 2] * a2));
         }
-        if (particles.shape[0] > TOTAL)
+        if (particles.shape[0] > TOTAL) {
             for (int j = 0; j < 3; ++j) {
                 const F a0 = row(TOTAL + j), a1 = row(TOTAL + 3 + j), a2 = row(TOTAL + 6 + j);
                 for (int i = 0; i < 3; ++i)
                     put(TOTAL + 3 * i + j, row(TOTAL + 3 * i + j)
                         + h * (C[3 * i] * a0 + C[3 * i + 1] * a1 + C[3 * i + 2] * a2));
             }
+            put(DENSITY, R[3] * (inverse * inverse * inverse));
+        }
 """
 
 _GATHER_CHANGE = """
@@ -308,6 +311,7 @@ def snippet(width: int, before: str, each: str, after: str = "") -> str:
         "STRESS": STRESS,
         "MASS": MASS,
         "TOTAL": TOTAL,
+        "DENSITY": DENSITY,
     }
     text = _GROUPS
     parts = {"before": before, "prelude": PRELUDE, "weights": _WEIGHTS, "each": each, "after": after}
@@ -627,13 +631,16 @@ def gather_particles(
     block = owners[i]
     corner = BLOCK * coords[block]
     v = wp.vec3()
+    mass = float(0.0)
     moment = wp.mat33()
     for a in range(width):
         for b in range(width):
             for c in range(width):
                 value = values[node_index(neighbors, block, base - corner + wp.vec3i(a, b, c))]
-                part = w[0, a] * w[1, b] * w[2, c] * wp.vec3(value[0], value[1], value[2])
+                weight = w[0, a] * w[1, b] * w[2, c]
+                part = weight * wp.vec3(value[0], value[1], value[2])
                 v += part
+                mass += weight * value[3]
                 moment += wp.outer(part, wp.vec3(float(a), float(b), float(c)) - f)
     scale = 4.0 * inverse
     if width == 4:
@@ -650,6 +657,7 @@ def gather_particles(
     if particles_out.shape[0] > TOTAL:
         total = read_matrix(particles_out, TOTAL, i)
         write_matrix(total + h * (C * total), TOTAL, i, particles_out)
+        particles_out[DENSITY, i] = mass * inverse * inverse * inverse
     x = read_vector(particles_out, POSITION, i)
     for k in range(3):
         u = x[k] * inverse
