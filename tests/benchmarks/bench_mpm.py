@@ -63,7 +63,8 @@ class Memory:
 
     def _held(self, field: str) -> int:
         if self._device != "cpu":
-            return wp.get_mempool_used_mem_high(self._device)
+            high = field == "VmHWM"
+            return (wp.get_mempool_used_mem_high if high else wp.get_mempool_used_mem_current)(self._device)
         try:
             lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
             return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(field))
