@@ -150,7 +150,7 @@ def decompose(
     check_arrays(vertices, faces)
     v, f = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
     if most == 1:
-        return _joined([_hull(v)])
+        return _joined([_hull(v[np.unique(f)])])
     if len(f) > FACES:
         w, g = decimate(v, f, FACES)
         v, f = w.astype(np.float64), g

@@ -25,6 +25,9 @@ JOINTS = {
     "ball": mujoco.mjtJoint.mjJNT_BALL,
 }
 
+HEAVY = 1e6
+"""A driven body weighs so many times what it meets: contact does not turn it from its way."""
+
 COLOR = (0.7, 0.7, 0.7, 1.0)
 
 
@@ -57,6 +60,19 @@ def add_rigid(spec: mujoco.MjSpec, body: RigidBody, name: str, timestep: float) 
         item.armature, item.frictionloss = 0.0, 0.0
     solref = reference(body.restitution, timestep)
     return added, add_shapes(spec, added, body.shapes, name, body.friction, solref)
+
+
+def add_driven(spec: mujoco.MjSpec, name: str, mass: float, size: float = 1.0) -> Any:
+    """A body of `size` m at the origin that is put on its way before every step; contact knows its speed.
+
+    It moves freely within a step, and weighs so much more than the `mass` in kg it meets that it hardly does.
+    """
+    added = spec.worldbody.add_body(name=name, gravcomp=1.0)
+    set_mass(added, HEAVY * mass, HEAVY * mass * size * size * np.eye(3))
+    item = added.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_FREE)
+    item.align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
+    item.armature, item.frictionloss, item.damping = 0.0, 0.0, [0.0] * 3
+    return added
 
 
 def set_mass(added: Any, mass: float, inertia: np.ndarray) -> None:
@@ -98,4 +114,4 @@ def add_shapes(
     return geoms
 
 
-__all__ = ["add_rigid", "add_shapes", "quaternion", "set_mass"]
+__all__ = ["add_driven", "add_rigid", "add_shapes", "quaternion", "set_mass"]

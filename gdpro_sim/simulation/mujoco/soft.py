@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, set_contact
-from gdpro_sim.simulation.mujoco.rigid import COLOR
+from gdpro_sim.simulation.mujoco.rigid import COLOR, add_driven
 from gdpro_sim.simulation.mujoco_model import SoftBody
 
 LEAST_NODE = 1e-3
@@ -52,8 +52,7 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
         leader = _leaders(body, positions, held)
         masses = np.bincount(leader, weights=masses, minlength=len(masses))
     for k in range(len(body.motions)):
-        mover = spec.worldbody.add_body(name=f"{name}_pin{k}", mocap=True)
-        mover.explicitinertial = True
+        add_driven(spec, pin_name(name, k), float(body.masses.sum()))
     names = [""] * len(positions)
     least = 1e-12
     for i in np.flatnonzero(~held & (leader == np.arange(len(positions)))).tolist():
@@ -66,7 +65,7 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
             item.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             item.armature, item.damping, item.frictionloss = 0.0, [0.0] * 3, 0.0
     owners = [
-        names[leader[i]] or (f"{name}_pin{driver[i]}" if driver[i] >= 0 else "world")
+        names[leader[i]] or (pin_name(name, driver[i]) if driver[i] >= 0 else "world")
         for i in range(len(positions))
     ]
     local = np.where(held[:, None], positions, positions - positions[leader])
@@ -91,6 +90,11 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
     )
     set_contact(flex, body.friction, FLEX_REFERENCE)
     return Points(positions, masses, tuple(names))
+
+
+def pin_name(name: str, k: int) -> str:
+    """Of the body that motion `k` of a soft body moves."""
+    return f"{name}_pin{k}"
 
 
 def grid(body: SoftBody) -> tuple[np.ndarray, np.ndarray]:
@@ -192,4 +196,4 @@ def flex_vertices(data: Any, begin: int, count: int) -> np.ndarray:
     return np.asarray(data.flexvert_xpos).reshape(-1, 3)[begin : begin + count]
 
 
-__all__ = ["Points", "add_soft", "flex_vertices", "grid", "velocities"]
+__all__ = ["Points", "add_soft", "flex_vertices", "grid", "pin_name", "velocities"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -11,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.errors import SolverError
-from gdpro_sim.simulation.conditions import pose_at
+from gdpro_sim.simulation.conditions import Motion, pose_at
 from gdpro_sim.simulation.model import Diagnostics, Model
 from gdpro_sim.simulation.mujoco import soft
 from gdpro_sim.simulation.mujoco.energy import elastic_energy, volume_ratios
@@ -74,13 +75,9 @@ class SolverMuJoCo:
             for i, (name, points) in enumerate(zip(self.world.names, self.world.points, strict=True))
             if points is not None
         }
-        self._moved = [
-            (self.mjmodel.joint(name), collider)
-            for name, collider in zip(self.world.obstacles, model.colliders, strict=True)
-            if name
-        ]
-        movers = {self.mjmodel.body(name).id for name in self.world.obstacles if name}
-        self.counted = np.array([i not in movers for i in range(self.mjmodel.nbody)])
+        self._driven = list(self._driven_bodies())
+        driven = {self.mjmodel.body(name).id for name, *_ in self._driven}
+        self.counted = np.array([i not in driven for i in range(self.mjmodel.nbody)])
         self._count = _Count()
         self.reset()
 
@@ -255,29 +252,32 @@ class SolverMuJoCo:
 
     def _drive(self, time: float, h: float) -> None:
         """Put moved obstacles and pins where they are at `time`, moving as in the `h` s that follow."""
-        for joint, collider in self._moved:
-            assert collider.motion is not None
+        for name, motion, rotation, position in self._driven:
+            joint = self.mjmodel.joint(name)
             place, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
-            turn, shift = pose_at(collider.motion, time)
-            rotation, position = turn @ collider.rotation, turn @ collider.position + shift
-            x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-            self.mjdata.qpos[place : place + 7] = [*position, w, x, y, z]
+            turn, shift = pose_at(motion, time)
+            now, at = turn @ rotation, turn @ position + shift
+            x, y, z, w = Rotation.from_matrix(now).as_quat()
+            self.mjdata.qpos[place : place + 7] = [*at, w, x, y, z]
             if h > 0.0:
-                later, moved = pose_at(collider.motion, time + h)
-                spin = Rotation.from_matrix(rotation.T @ later @ collider.rotation).as_rotvec() / h
-                velocity = (later @ collider.position + moved - position) / h
+                later, moved = pose_at(motion, time + h)
+                spin = Rotation.from_matrix(now.T @ later @ rotation).as_rotvec() / h
+                velocity = (later @ position + moved - at) / h
                 self.mjdata.qvel[dof : dof + 6] = [*velocity, *spin]
         assert self.model.mujoco is not None
         for control in self.model.mujoco.controls:
             value = np.interp(time, control.times, control.values)
             self.mjdata.actuator(control.actuator).ctrl = value
+
+    def _driven_bodies(self) -> Iterator[tuple[str, Motion, np.ndarray, np.ndarray]]:
+        """(name, motion, rotation [3, 3] and position [3] m at the start) of moved obstacles and pins."""
+        for name, collider in zip(self.world.obstacles, self.model.colliders, strict=True):
+            if collider.motion is not None:
+                yield name, collider.motion, collider.rotation, collider.position
         for body, name in zip(self.bodies, self.world.names, strict=True):
             if isinstance(body, SoftBody):
                 for k, motion in enumerate(body.motions):
-                    mocap = int(self.mjmodel.body_mocapid[self.mjmodel.body(f"{name}_pin{k}").id])
-                    turn, shift = pose_at(motion, time + h)
-                    x, y, z, w = Rotation.from_matrix(turn).as_quat()
-                    self.mjdata.mocap_pos[mocap], self.mjdata.mocap_quat[mocap] = shift, [w, x, y, z]
+                    yield soft.pin_name(name, k), motion, np.eye(3), np.zeros(3)
 
     def _motion(self, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Centres [b, 3], their velocities [b, 3], spins [b, 3] and inertias [b, 3, 3], world axes."""

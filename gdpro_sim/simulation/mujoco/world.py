@@ -21,9 +21,6 @@ from gdpro_sim.simulation.mujoco_model import MujocoWorld, RigidBody, Shape, Sof
 
 log = logging.getLogger(__name__)
 
-HEAVY = 1e6
-"""A moved obstacle weighs so many times what all bodies weigh: contact does not turn it from its way."""
-
 CONVEX = 0.99
 """A mesh that fills this share of its convex hull is taken as convex."""
 
@@ -90,10 +87,9 @@ def build(model: Model) -> World:
         floor = spec.worldbody.add_geom(name=name("ground"), type=mujoco.mjtGeom.mjGEOM_PLANE)
         floor.pos, floor.size = [0.0, 0.0, model.ground.height], [0.0, 0.0, 1.0]
         _passive(floor, 0.0)
-    heavy = HEAVY * max(_weight(world), 1.0)
     obstacles = []
     for collider in model.colliders:
-        obstacles.append(_obstacle(spec, collider, name(collider.name), heavy, geoms))
+        obstacles.append(_obstacle(spec, collider, name(collider.name), max(_weight(world), 1.0), geoms))
     return World(spec, tuple(names), tuple(points), tuple(obstacles), tuple(renamed), start)
 
 
@@ -202,20 +198,14 @@ def _obstacle(
     spec: mujoco.MjSpec,
     collider: Collider,
     title: str,
-    heavy: float,
+    weight: float,
     geoms: list[tuple[float, list[Any], tuple[float, float]]],
 ) -> str:
     """Geoms of an obstacle; returns the name of the body that moves it, "" where it stands still."""
     parent, shift = spec.worldbody, collider.position
     if collider.motion is not None:
-        # A free body of endless weight, put on its way before every step: contact then knows its velocity.
-        parent = spec.worldbody.add_body(name=title, pos=collider.position.tolist(), gravcomp=1.0)
-        parent.quat = rigid.quaternion(collider.rotation)
-        size = max(max(collider.size), 0.1) ** 2
-        rigid.set_mass(parent, heavy, heavy * size * np.eye(3))
-        item = parent.add_joint(name=title, type=mujoco.mjtJoint.mjJNT_FREE)
-        item.align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
-        item.armature, item.frictionloss, item.damping = 0.0, 0.0, [0.0] * 3
+        parent = rigid.add_driven(spec, title, weight, max(*collider.size, 0.1))
+        parent.pos, parent.quat = collider.position.tolist(), rigid.quaternion(collider.rotation)
         shift, turn = np.zeros(3), np.eye(3)
     else:
         turn = collider.rotation
