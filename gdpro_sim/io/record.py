@@ -53,7 +53,7 @@ RESUME_FORMAT = 2
 IMPLICIT = ("newton_iterations", "cg_iterations", "residual", "converged", "contact_energy", "force_energy")
 """Figures that the explicit MPM has not: its metrics leave them out."""
 
-SPREAD = 0.4
+SPREAD = 0.3
 """How far to each side pictures expect matter to flow, as a multiple of its height at the start."""
 
 WIDE = 6.0
