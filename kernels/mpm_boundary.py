@@ -70,9 +70,6 @@ DEEPEST = wp.constant(0.5)
 FAR = wp.constant(1.0e30)
 """Gap of a node without matter near, m."""
 
-SEEN = wp.constant(0.4)
-"""Gaps wider than that many cells are not looked at: no substep closes them."""
-
 SUMS = wp.constant(42)
 """Numbers of `sum_coupling`: a matrix 6 x 6, row by row, and a vector."""
 
@@ -323,6 +320,7 @@ def find_gaps(
     width: int,
     spacing: float,
     radius: float,
+    seen: float,
     owner: wp.array[int],
     block: wp.array[int],
     around: wp.array[int],
@@ -338,7 +336,7 @@ def find_gaps(
 ):
     """Smallest gap between an obstacle and the particles of a block, at each node that these reach, m.
 
-    radius: m, of a particle
+    radius: m, of a particle; seen: m, gaps wider than that do not count
     owner:  [Q] obstacle of each tile; block: [Q] its block of particles
     around: [27 Q] the pair of each block of nodes beside it; -1 where it is too far away
     shape:  [C] kind of each obstacle's shape
@@ -350,7 +348,6 @@ def find_gaps(
     side = side_of_tile(width)
     room = side * side * side
     corner = BLOCK * coords[b]
-    seen = SEEN * spacing
     near = int(0)
     if int(table[c, KIND]) != ABSENT:
         if shape[c] == PLANE:

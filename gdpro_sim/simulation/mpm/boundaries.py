@@ -2,9 +2,9 @@
 
 Nodes in an obstacle, and those right outside, cannot move matter into it: it sticks, slips, or leaves and
 rubs, see `gdpro_sim.kernels.mpm_boundary`. What is held back is the surface of the particles, half their
-spacing from their middles. Where they overlap all the same, matter is pushed out slowly. Two limits: an obstacle
-thinner than two cells may have too few nodes to keep matter out (the log says which), and one that comes nearer
-by more than 0.4 cells in a substep overlaps matter before it pushes.
+spacing from their middles. Where they overlap all the same, matter is pushed out slowly. Two limits: an
+obstacle thinner than two cells may have too few nodes to keep matter out (the log says which), and one that
+comes nearer by more than `SEEN` cells in a substep overlaps matter before it pushes.
 """
 
 from __future__ import annotations
@@ -40,8 +40,12 @@ NODES_REACH = 1.5
 PARTICLES_REACH = 3.0
 """From the middle of a block's particles to where the last may stray, in cells along each axis."""
 
-FIELD_REACH = 2.5
-"""Cells from an obstacle up to which nodes know its distance: those around any particle that may touch it."""
+SEEN = {"explicit": 0.4, "implicit": 1.75}
+"""Gaps wider than that many cells are not looked at. An explicit substep closes no wider ones, and across the
+wider of the two matter and obstacle share no nodes."""
+
+AROUND = 2.1
+"""Cells around what is seen that nodes know the distance of, to tell it between them."""
 
 MARGIN = 1.0
 """Cells that a moving obstacle may go before the blocks near it are looked for again."""
@@ -95,6 +99,7 @@ class Obstacles:
         friction = np.array([m.friction for m in model.particles.materials], np.float32)
         self._friction: wp.array = wp.array(friction, dtype=float, device=model.device)
         self._radius = 0.5 * model.particles.spacing
+        self._sees = SEEN[model.mpm.integrator]
         kinds = np.array([COLLIDER_KINDS[item.kind] for item in self.items], np.int32)
         self._kinds: wp.array = wp.array(kinds, dtype=int, device=model.device)
         share = np.bincount(model.particles.matter, model.particles.volumes, len(friction))
@@ -253,10 +258,10 @@ class Obstacles:
         distance = grid.array("obstacles.distance", len(blocks), wp.float64)
         inputs = [c, wp.float64(middle), self._structs[c], self._table, wp.float64(grid.spacing), blocks]
         grid.launch(kernels.measure_blocks, len(blocks), inputs, [distance])
-        cells = reach * math.sqrt(3.0) + FIELD_REACH
+        cells = reach * math.sqrt(3.0) + self._sees + AROUND
         if self.items[c].kind == "plane":
             normal = self._host[c, kernels.ROTATION : kernels.LINEAR].reshape(3, 3)[:, 2]
-            beyond = kernels.SEEN + self._radius / grid.spacing
+            beyond = self._sees + self._radius / grid.spacing
             cells = reach * float(np.abs(normal).sum())
             cells += kernels.OUTSIDE if reach == NODES_REACH else beyond
         if c in self._moving:
@@ -293,8 +298,9 @@ class Obstacles:
             self._met.zero_()
             return
         inputs = [
-            grid.width, grid.spacing, self._radius, self._tile_owner, self._tile_block, self._around,
-            self._kinds, self._table, self._field, grid.starts, grid.coords, grid.particles,
+            grid.width, grid.spacing, self._radius, self._sees * grid.spacing, self._tile_owner,
+            self._tile_block, self._around, self._kinds, self._table, self._field, grid.starts,
+            grid.coords, grid.particles,
         ]  # fmt: skip
         grid.launch(kernels.find_gaps, self._tile_count, inputs, [self._seen, self._tiles], minimum=4)
         inputs = [grid.width, grid.spacing, self._tile, self._seen, self._tiles, self._field]
