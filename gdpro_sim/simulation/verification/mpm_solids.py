@@ -39,32 +39,39 @@ SOUND = math.sqrt(YOUNG / DENSITY)
 """Of waves along a thin bar, m/s."""
 
 
-def _bar_vibration(cells: int, kernel: str) -> tuple[float, float]:
-    """(period / its value, amplitude after two periods / before) of a bar of `cells` cells a metre.
+PERIOD = 4.0 / SOUND
+"""Of a free-fixed bar of 1 m, s."""
+
+
+def _bar(cells: int, **settings: Any) -> tuple[SolverMPM, np.ndarray]:
+    """A bar of 1 m, `cells` cells long, in its first axial mode, and the shape [N] of that.
 
     Its middle plane is held by symmetry: it is a free-fixed bar and its mirror image.
     """
-    length, dx = 1.0, 1.0 / cells
-    points = lattice((2.0 * length, dx, dx), (4 * cells, 2, 2), (-length, 0.0, 0.0))
-    angle = np.pi * points.positions[:, 0] / (2.0 * length)
+    dx = 1.0 / cells
+    points = lattice((2.0, dx, dx), (4 * cells, 2, 2), (-1.0, 0.0, 0.0))
+    angle = 0.5 * np.pi * points.positions[:, 0]
     speed = 1e-3 * SOUND
     velocities, gradients = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
     velocities[:, 0] = speed * np.sin(angle)
-    gradients[:, 0, 0] = speed * np.pi / (2.0 * length) * np.cos(angle)
+    gradients[:, 0, 0] = speed * 0.5 * np.pi * np.cos(angle)
     material = {"young": YOUNG, "poisson": 0.0, "density": DENSITY, "model": "corotated"}
-    solver = SolverMPM(
-        make_model(points, material, dx=dx, velocities=velocities, gradients=gradients, kernel=kernel)
-    )
-    period = 4.0 * length / SOUND
-    times, found = [0.0], [float(np.sin(angle) @ velocities[:, 0])]
-    while solver.time < 2.02 * period:
-        solver.step(period / 48)
+    model = make_model(points, material, dx=dx, velocities=velocities, gradients=gradients, **settings)
+    return SolverMPM(model), np.sin(angle)
+
+
+def _bar_vibration(cells: int, kernel: str) -> tuple[float, float]:
+    """(period / its value, amplitude after two periods / before)."""
+    solver, mode = _bar(cells, kernel=kernel)
+    times, found = [0.0], [float(mode @ solver.velocities[:, 0].astype(np.float64))]
+    while solver.time < 2.02 * PERIOD:
+        solver.step(PERIOD / 48)
         times.append(solver.time)
-        found.append(float(np.sin(angle) @ solver.velocities[:, 0].astype(np.float64)))
+        found.append(float(mode @ solver.velocities[:, 0].astype(np.float64)))
     a, t = np.array(found), np.array(times)
     k = np.flatnonzero(np.sign(a[1:]) != np.sign(a[:-1]))
     zeros = t[k] - a[k] * (t[k + 1] - t[k]) / (a[k + 1] - a[k])
-    return 2.0 * float(np.diff(zeros).mean()) / period, float(np.abs(a[t > 1.5 * period]).max() / a[0])
+    return 2.0 * float(np.diff(zeros).mean()) / PERIOD, float(np.abs(a[t > 1.5 * PERIOD]).max() / a[0])
 
 
 @problem(
@@ -82,6 +89,24 @@ def vibration() -> Iterator[Check]:
     yield at_least("order in grid size", 1.7, order([1 / 10, 1 / 20, 1 / 40], errors))
     period, _ = _bar_vibration(20, "cubic")
     yield absolute("cubic, 20 cells: period / (4 L sqrt(rho / E))", 1.0, period, 1.8e-3)
+
+
+@problem(
+    "implicit",
+    title="The same bar in long implicit steps: energy lost in each",
+    source="backward Euler: energy of a linear mode x 1 / (1 + w^2 dt^2) a step (Hairer & Wanner)",
+)
+def implicit() -> Iterator[Check]:
+    tight = {"newton_tolerance": 1e-7, "cg_tolerance": 1e-6, "cfl": 10.0, "substeps": 1}
+    for steps in (25, 50):
+        solver, _ = _bar(10, integrator="implicit", **tight)
+        begin = mechanical_energy(solver)
+        for _ in range(steps // 2):
+            solver.step(PERIOD / steps)
+        kept = (mechanical_energy(solver) / begin) ** (1.0 / (steps // 2))
+        expected = 1.0 / (1.0 + (2.0 * math.pi / steps) ** 2)
+        yield relative(f"{steps} steps a period: energy lost in one", 1.0 - expected, 1.0 - kept, 3e-2)
+        yield at_least("  converged", 1.0, float(solver.diagnostics().converged))
 
 
 @problem(
@@ -308,6 +333,7 @@ def against_fem() -> Iterator[Check]:
 
 PROBLEMS = (
     vibration,
+    implicit,
     rotating_disc,
     colliding_discs,
     colliding_discs_fine,
