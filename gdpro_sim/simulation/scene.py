@@ -8,7 +8,7 @@ import importlib.util
 import logging
 import math
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
@@ -29,6 +29,9 @@ from gdpro_sim.simulation.mujoco_options import MujocoBody, MujocoOptions
 from gdpro_sim.simulation.options import Options, Vector, several
 from gdpro_sim.simulation.regions import Region
 from gdpro_sim.simulation.solver_options import FemOptions, SolverOptions
+
+if TYPE_CHECKING:
+    from gdpro_sim.asset import Asset
 
 log = logging.getLogger(__name__)
 
@@ -314,10 +317,17 @@ def drop_scene(asset: str | Path) -> Scene:
         "name": path.stem,
         "description": description,
         "bodies": [body],
-        "solver": {"substeps": 4},
+        "solver": {"kind": "mpm"} if _for_mpm(loaded) else {"substeps": 4},
         "duration": max(1.5, round(4.0 * math.sqrt(size / 9.81), 1)),  # the fall takes a quarter of it
     }
     return check_scene(data, str(path))
+
+
+def _for_mpm(asset: Asset) -> bool:
+    """Whether only MPM can simulate it: it flows or tears, or it is a cloud of pieces without a mesh."""
+    faces = asset.gaussians.faces
+    cloud = asset.tets is None and len(faces.unique()) == faces.numel()
+    return cloud or (asset.material is not None and asset.material.mpm_only() is not None)
 
 
 def load_scene(scene: str | Path) -> Scene:

@@ -14,12 +14,13 @@ from gdpro_sim.asset import Asset, import_mesh
 from gdpro_sim.asset.from_splats import bind_splats
 from gdpro_sim.errors import SceneError
 from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.materials import Material
 from gdpro_sim.simulation.compile import compile_scene, load_assets
 from gdpro_sim.simulation.conditions import FOREVER, Force, Impulse
 from gdpro_sim.simulation.model import Model, Particles
 from gdpro_sim.simulation.mpm import SolverMPM
 from gdpro_sim.simulation.run import solver_of
-from gdpro_sim.simulation.scene import check_scene
+from gdpro_sim.simulation.scene import check_scene, load_scene
 
 VOLUME = 0.2**3
 
@@ -260,6 +261,17 @@ def test_fem_refuses_what_is_for_mpm(cube: Asset) -> None:
         assets = {"cube": _with_tets(cube)}
         with pytest.raises(SceneError, match=expected):
             compile_scene(check_scene(data), assets)
+
+
+def test_assets_that_only_mpm_can_simulate_get_its_default_scene(cube: Asset, tmp_path: Path) -> None:
+    loose = Asset("cloud", bind_splats(cube.gaussians.gaussians()))
+    for name, asset, kind in (
+        ("jelly", cube, "fem"),
+        ("sand", replace(cube, material=Material.model_validate("sand")), "mpm"),
+        ("cloud", loose, "mpm"),
+    ):
+        asset.save(tmp_path / f"{name}.usdc")
+        assert load_scene(tmp_path / f"{name}.usdc").solver.kind == kind, name
 
 
 def _with_tets(asset: Asset) -> Asset:
