@@ -86,7 +86,7 @@ def _collapse(aspects: tuple[float, ...]) -> Iterator[Check]:
         expected = 1.2 * aspect if aspect < 3.0 else 1.9 * aspect ** (2.0 / 3.0)
         yield relative(f"a = {aspect:g}: run-out / width", expected, run_out, 0.4)
         expected = aspect if aspect < 1.15 else aspect**0.4
-        yield relative("  height / width", expected, height, 0.4)
+        yield relative("  height / width", expected, height, 0.2 if aspect < 3.0 else 0.45)
         yield at_most("  fastest particle at the end / that of the fall", 0.1, fastest / math.sqrt(aspect))
         yield at_most("  largest rise of energy / energy", 1e-3, rise)
 
