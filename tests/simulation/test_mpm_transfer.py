@@ -68,6 +68,15 @@ class Case:
             f[rows.VOLUME],
         )
 
+    def densities(self, kernel: str) -> np.ndarray:
+        """Of the grid around each particle, kg/m^3."""
+        cloud = self.cloud()
+        reach = reference.stencil(kernel, cloud.positions, SPACING)
+        nothing = np.zeros_like(self.forces)
+        nodes = reference.to_grid(cloud, reach, affine=False, forces=nothing, h=H, inertia=1.0)
+        found: np.ndarray = (reach.weights * nodes.masses[nodes.places]).sum(axis=1) / SPACING**3
+        return found
+
     def grid(self, kernel: str, **options: Any) -> Grid:
         matter = np.zeros(len(self.positions), np.int32)
         options = {"max_cells": 1 << 31, "device": "cpu", **options}
@@ -192,6 +201,7 @@ def test_a_substep_is_the_oracles(kernel: str, transfer: str, flip: float, total
         start = case._matrix(rows.TOTAL)
         got = grid.rows(rows.TOTAL, 9).reshape(-1, 3, 3)
         np.testing.assert_allclose(got, start + H * expected.affine @ start, atol=3e-6)
+        np.testing.assert_allclose(grid.rows(rows.DENSITY, 1)[:, 0], case.densities(kernel), rtol=1e-5)
 
 
 def one_by_one(grid: Grid, transfer: str = "apic", flip: float = 0.0) -> None:
@@ -236,6 +246,7 @@ def test_one_by_one_is_the_oracles(kernel: str, transfer: str, flip: float) -> N
     grid = case.grid(kernel)
     one_by_one(grid, transfer, flip)
     assert_moved(grid, case.step(kernel, transfer, flip))
+    np.testing.assert_allclose(grid.rows(rows.DENSITY, 1)[:, 0], case.densities(kernel), rtol=1e-5)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
