@@ -32,14 +32,21 @@ SETTLED = 4.0
 """Multiple of `newton_tolerance` that does where boundaries are about: friction settles slowly."""
 
 
+FOLLOWED = 12
+"""Iterations that follow the boundaries; the next ones keep what is in the way, and friction, as they are."""
+
+
 class Outcome(NamedTuple):
-    """residual: m/s, of the last Newton step, as if nodes had a full cell's mass"""
+    """residual: m/s, of the last Newton step, as if nodes had a full cell's mass
+    lagging:  whether it has converged but for boundaries, which still changed by `residual`
+    """
 
     converged: bool
     finite: bool
     residual: float
     newton_iterations: int
     cg_iterations: int
+    lagging: bool = False
 
 
 class GridNewton:
@@ -121,11 +128,11 @@ class GridNewton:
         scale = max(speed, math.hypot(*change), 1e-6)
         energy = self._choose_start(h, change, scale)
         tolerance = settings.newton_tolerance * (SETTLED if self.boundaries else 1.0)
-        self._iterations, residual, done, settled = 0, math.inf, 0, False
+        self._iterations, residual, lag, done, settled = 0, math.inf, 0.0, 0, False
         while done < settings.newton_iterations and math.isfinite(energy):
             self.linearise(h)
             jump = 0.0
-            if self.boundaries:
+            if self.boundaries and done < FOLLOWED:
                 jump = self._meet_boundaries(h, scale)
                 if settled and jump <= tolerance:
                     return Outcome(True, True, max(residual, jump), done, self._iterations)
@@ -139,6 +146,7 @@ class GridNewton:
             slope, move = self._measure(self._step)
             done += 1
             residual = max(jump, move)
+            lag = residual if done == FOLLOWED else lag
             if not math.isfinite(slope + move):
                 energy = math.inf
                 break
@@ -148,6 +156,9 @@ class GridNewton:
             if settled and not self.boundaries:
                 self._balance()
                 return Outcome(True, True, residual, done, self._iterations)
+            if settled and done > FOLLOWED:
+                residual = max(lag, residual)
+                return Outcome(residual <= tolerance, True, residual, done, self._iterations, lagging=True)
             if length == 0.0 and not settled:
                 break
         return Outcome(False, math.isfinite(energy), residual, done, self._iterations)

@@ -217,7 +217,7 @@ class SolverMPM:
             outcome = newton.solve(h, [h * g for g in self.model.gravity], self._affine)
             counters.newton_iterations += outcome.newton_iterations
             counters.cg_iterations += outcome.cg_iterations
-            if outcome.converged or halving == HALVINGS:
+            if outcome.converged or outcome.lagging or halving == HALVINGS:
                 break
             h *= 0.5
         if not outcome.finite:
