@@ -16,7 +16,8 @@ from gdpro_sim.kernels.mpm_boundary import (
     row_matrix,
     row_vector,
 )
-from gdpro_sim.kernels.mpm_transfer import BLOCK, spline_weights
+from gdpro_sim.kernels.mpm_particles import spline_weights
+from gdpro_sim.kernels.mpm_transfer import BLOCK
 from gdpro_sim.kernels.particles import (
     AFFINE,
     MASS,

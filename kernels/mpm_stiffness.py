@@ -13,6 +13,7 @@ import warp as wp
 
 from gdpro_sim.kernels.lanes import CPU_FLAGS
 from gdpro_sim.kernels.mpm_implicit import GRADIENT, LEFT, MOMENT, PAIRS, RIGHT, SCALING
+from gdpro_sim.kernels.mpm_particles import node_index, spline_weights
 from gdpro_sim.kernels.mpm_transfer import (
     BLOCK,
     GATHER_AFFINE,
@@ -20,9 +21,7 @@ from gdpro_sim.kernels.mpm_transfer import (
     GATHER_EACH,
     SCATTER_BEFORE,
     SCATTER_NODES,
-    node_index,
     snippet,
-    spline_weights,
 )
 from gdpro_sim.kernels.particles import POSITION, read_matrix, read_vector, write_matrix
 

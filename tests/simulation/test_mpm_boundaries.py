@@ -432,11 +432,11 @@ def test_a_rigid_body_and_matter_keep_their_momentum(options: dict[str, Any]) ->
     energy = bodies.kinetic_energy
     run(solver, 0.3)
     d = solver.diagnostics()
-    after = before * 0 + [bodies.momentum + d.momentum, bodies.angular_momentum + d.angular_momentum]
+    after = np.array([d.momentum, d.angular_momentum])
     scale = np.linalg.norm(before[0])
-    assert np.abs(np.asarray(d.momentum)).max() > 0.2 * scale  # they have met
+    assert np.abs(bodies.momentum - before[0]).max() > 0.2 * scale  # they have met
     assert np.abs(after - before).max() < 2e-5 * scale
-    assert bodies.kinetic_energy + d.kinetic_energy + d.elastic_energy < energy * 1.001
+    assert d.kinetic_energy + d.elastic_energy < energy * 1.001
 
 
 def test_a_rigid_body_rests_on_matter_and_sinks_by_its_weight() -> None:

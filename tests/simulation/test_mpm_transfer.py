@@ -12,7 +12,7 @@ import warp as wp
 
 from gdpro_sim import device as devices
 from gdpro_sim.errors import SolverError
-from gdpro_sim.kernels import mpm_grid, mpm_transfer
+from gdpro_sim.kernels import mpm_grid, mpm_particles
 from gdpro_sim.kernels import particles as rows
 from gdpro_sim.simulation.mpm.grid import Grid
 from tests.reference import mpm as reference
@@ -216,7 +216,7 @@ def one_by_one(grid: Grid, transfer: str = "apic", flip: float = 0.0) -> None:
         grid.values.zero_()
         common = (grid.width, h, SPACING, affine)
         place = (grid.owners, grid.coords, grid.neighbors)
-        launch(mpm_transfer.scatter_particles, count, *common, *place, grid.particles, grid.values)
+        launch(mpm_particles.scatter_particles, count, *common, *place, grid.particles, grid.values)
         launch(mpm_grid.momentum_to_velocity, len(grid.values), change, grid.values)
 
     if flip > 0.0:
@@ -228,10 +228,16 @@ def one_by_one(grid: Grid, transfer: str = "apic", flip: float = 0.0) -> None:
         assert grid.change is not None
         launch(mpm_grid.change_of_velocity, len(grid.values), grid.values, grid.change)
         launch(
-            mpm_transfer.add_change_particles, count, grid.width, SPACING, *place, grid.change, grid.particles
+            mpm_particles.add_change_particles,
+            count,
+            grid.width,
+            SPACING,
+            *place,
+            grid.change,
+            grid.particles,
         )
     launch(
-        mpm_transfer.gather_particles,
+        mpm_particles.gather_particles,
         count,
         *(grid.width, H, SPACING, flip),
         *(*place, grid.values, grid.particles, grid.strayed),

@@ -181,7 +181,7 @@ def collider_contacts(model: Model, rest: RestShapes) -> tuple[ColliderContact, 
     Raises SolverError for what only MPM knows.
     """
     if model.ground is not None and model.ground.boundary != "separate":
-        raise SolverError("FEM's ground knows no `boundary` but \"separate\"; leave it out, or use MPM")
+        raise SolverError('FEM\'s ground knows no `boundary` but "separate"; leave it out, or use MPM')
     for collider in model.colliders:
         for key, usual in (("boundary", "separate"), ("mass", None), ("start", 0.0), ("end", FOREVER)):
             if getattr(collider, key) != usual:

@@ -10,7 +10,7 @@ import warp as wp
 
 from gdpro_sim.device import Launches
 from gdpro_sim.errors import SolverError
-from gdpro_sim.kernels import mpm_grid, mpm_transfer
+from gdpro_sim.kernels import mpm_grid, mpm_particles, mpm_transfer
 from gdpro_sim.kernels.particles import POSITION, SPEED
 
 OFFSETS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(27, 3)
@@ -214,7 +214,7 @@ class Grid:
             return
         self.values.zero_()
         self.launch(
-            mpm_transfer.scatter_particles,
+            mpm_particles.scatter_particles,
             len(self.ids),
             [*common, self.owners, self.coords, self.neighbors, self.particles],
             [self.values],
@@ -241,7 +241,7 @@ class Grid:
             )
         else:
             self.launch(
-                mpm_transfer.add_change_particles,
+                mpm_particles.add_change_particles,
                 len(self.ids),
                 [*common, self.owners, self.coords, self.neighbors, self.change],
                 [self.particles],
@@ -260,7 +260,7 @@ class Grid:
             )
         else:
             self.launch(
-                mpm_transfer.gather_particles,
+                mpm_particles.gather_particles,
                 len(self.ids),
                 [*common, self.owners, self.coords, self.neighbors, self.values],
                 [self.particles, self.strayed],

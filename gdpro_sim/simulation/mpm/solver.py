@@ -13,7 +13,7 @@ from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import mpm_energy, mpm_laws
 from gdpro_sim.kernels import particles as rows
 from gdpro_sim.simulation.model import Diagnostics, Model, Particles
-from gdpro_sim.simulation.mpm.boundaries import boundaries
+from gdpro_sim.simulation.mpm.boundaries import Obstacles, boundaries
 from gdpro_sim.simulation.mpm.grid import Grid
 from gdpro_sim.simulation.mpm.implicit import GridNewton
 from gdpro_sim.simulation.mpm.matter import Matter
@@ -289,12 +289,18 @@ class SolverMPM:
         spin = np.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], axis=1)
         momentum = (mass * v).sum(0)
         angular = (mass * (np.cross(x, v) + inertia * spin)).sum(0)
+        gravity = np.asarray(self.model.gravity, np.float64)
+        height = -float((mass * x).sum(0) @ gravity)
+        for bodies in (b.bodies for b in self.boundaries if isinstance(b, Obstacles)):  # free rigid ones
+            kinetic += bodies.kinetic_energy
+            momentum, angular = momentum + bodies.momentum, angular + bodies.angular_momentum
+            height -= float(bodies.mass @ bodies.positions @ gravity)
         volume = np.linalg.det(self.deformations.astype(np.float64))
         return Diagnostics(
             time=self._time,
             kinetic_energy=kinetic,
             elastic_energy=self._elastic_energy(),
-            gravity_energy=-float((mass * x).sum(0) @ np.asarray(self.model.gravity)),
+            gravity_energy=height,
             contact_energy=0.0,
             momentum=(float(momentum[0]), float(momentum[1]), float(momentum[2])),
             angular_momentum=(float(angular[0]), float(angular[1]), float(angular[2])),
