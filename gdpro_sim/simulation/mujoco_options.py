@@ -10,8 +10,8 @@ from pydantic import Field, field_validator, model_validator
 from gdpro_sim.simulation.mujoco_model import JointKind, MujocoSettings, Reduction
 from gdpro_sim.simulation.options import Number, Options, Vector
 
-RIGID_TIMESTEP = 1e-3
-SOFT_TIMESTEP = 2e-3
+SOFT = MujocoSettings(timestep=2e-3, tolerance=1e-6, impratio=1.0)
+"""With soft bodies, whose contacts take conjugate gradients many iterations."""
 
 Cells = Annotated[int, Field(ge=1, le=16)]
 
@@ -34,12 +34,13 @@ class MujocoOptions(Options):
     iterations: int = Field(
         default=MujocoSettings.iterations, ge=1, le=10_000, description="of the constraint solver, at most"
     )
-    tolerance: float = Field(
-        default=MujocoSettings.tolerance, gt=0.0, lt=1.0, description="at which they end"
+    tolerance: float | None = Field(
+        default=None, gt=0.0, lt=1.0, description="at which they end; default: 1e-8, or 1e-6 with soft bodies"
     )
-    impratio: float = Field(
-        default=MujocoSettings.impratio, gt=0.0,
-        description="stiffness of friction over that of contact normals: a high one creeps less",
+    impratio: float | None = Field(
+        default=None, gt=0.0,
+        description="stiffness of friction over that of contact normals: a high one creeps less, and takes "
+        "longer; default: 100, or 1 with soft bodies",
     )  # fmt: skip
     cone: Literal["elliptic", "pyramidal"] = Field(default=MujocoSettings.cone, description="of friction")
     base: str | None = Field(
@@ -73,8 +74,14 @@ class MujocoOptions(Options):
 
     def settings(self, soft: bool) -> MujocoSettings:
         """For the compiled model."""
-        step = self.timestep or (SOFT_TIMESTEP if soft else RIGID_TIMESTEP)
-        return MujocoSettings(step, self.iterations, self.tolerance, self.impratio, self.cone)
+        best = SOFT if soft else MujocoSettings()
+        return MujocoSettings(
+            self.timestep or best.timestep,
+            self.iterations,
+            self.tolerance or best.tolerance,
+            self.impratio or best.impratio,
+            self.cone,
+        )
 
 
 class MujocoBody(Options):

@@ -81,6 +81,24 @@ def test_rigid_and_soft_bodies_in_one_scene(ball: Asset) -> None:
     np.testing.assert_allclose(turned @ turned[0], rest @ rest[0], atol=1e-6)
 
 
+def test_a_scene_has_a_base_with_actuators(ball: Asset, tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        "<mujoco><worldbody><body name='arm' pos='0 0 1'><joint name='turn' axis='0 1 0' damping='1'/>"
+        "<geom type='capsule' fromto='0 0 0 .3 0 0' size='.02'/></body></worldbody>"
+        "<actuator><position name='turn' joint='turn' kp='100'/></actuator></mujoco>"
+    )
+    keys = [{"time": 0, "value": 0}, {"time": 0.3, "value": 1}]
+    scene = scene_of(
+        {"position": [1, 0, 0], "mujoco": {"form": "rigid", "shape": "sphere"}},
+        solver={"kind": "mujoco", "base": str(tmp_path / "arm.xml"), "controls": {"turn": keys}},
+        duration=1.0,
+    )
+    assert scene.files[-1].endswith("arm.xml")
+    simulation = Simulation(scene, {"b0": ball}, device="cpu")
+    assert len(list(simulation)) == 31
+    assert float(simulation.solver.mjdata.joint("turn").qpos[0]) == pytest.approx(1.0, abs=0.1)  # type: ignore[attr-defined]
+
+
 def test_mass_and_inertia_are_the_meshs(ball: Asset) -> None:
     model = compiled(ball, {"size": 0.4, "mujoco": {"form": "rigid", "shape": "box"}})
     assert model.mujoco is not None
