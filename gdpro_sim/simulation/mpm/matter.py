@@ -39,10 +39,11 @@ def sound_speed(material: Material) -> float:
 def largest_step(material: Material, spacing: float) -> float:
     """Longest substep that explicit viscosity is stable with on a grid of that spacing, s; inf: any.
 
-    The yielding of "herschel_bulkley" is implicit, and asks for none.
+    A particle without neighbours feels all three directions at once where it swells: its volume answers with
+    3 lambda + 2 mu, more than the lambda + 2 mu of waves. The yielding of "herschel_bulkley" is implicit, and asks for none.
     """
     lam, mu = material.lame
-    viscosity = material.rayleigh_stiffness * (lam + 2.0 * mu)
+    viscosity = material.rayleigh_stiffness * (3.0 * lam + 2.0 * mu)
     if material.model == "fluid":
         viscosity += 4.0 / 3.0 * material.viscosity
     if viscosity == 0.0:
