@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import os
 import sys
 import tempfile
@@ -18,9 +19,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
 from gdpro_sim.errors import DeviceError
+from gdpro_sim.kernels.threads import run_pieces
 
 if TYPE_CHECKING:
     import torch
@@ -104,6 +107,13 @@ PIECES = 4
 """Ranges for each thread, so that one that is held up leaves work to the others."""
 
 
+def _workers() -> ThreadPoolExecutor:
+    global _pool
+    if _pool is None:
+        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="gdpro")
+    return _pool
+
+
 def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1) -> None:
     """Call `function(begin, end)` over contiguous ranges that cover `range(count)`, from several threads.
 
@@ -111,7 +121,6 @@ def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1
     come free. Returns, or raises one of the exceptions, when every range has ended: nothing writes to the
     caller's memory afterwards.
     """
-    global _pool
     if count <= 0:
         return
     pieces = min(PIECES * thread_count(), max(1, count // max(1, minimum)))
@@ -119,8 +128,7 @@ def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1
     if threads == 1:
         function(0, count)
         return
-    if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="gdpro")
+    pool = _workers()
     bounds = [count * i // pieces for i in range(pieces + 1)]
     numbers = iter(range(pieces))
     lock = threading.Lock()
@@ -133,7 +141,7 @@ def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1
                 return
             function(bounds[piece], bounds[piece + 1])
 
-    futures = [_pool.submit(work) for _ in range(1, threads)]
+    futures = [pool.submit(work) for _ in range(1, threads)]
     try:
         work()
         wait(futures)
@@ -262,7 +270,7 @@ class Launches:
         if self.device != "cpu" or count < 2 * minimum or thread_count() == 1:
             recorded.launch(0, count, numbers)
         else:
-            run_chunks(lambda begin, end: recorded.launch(begin, end, numbers), count, minimum)
+            recorded.spread(count, min(PIECES * thread_count(), count // minimum), numbers)
 
 
 MAX_RECORDED = 512
@@ -281,32 +289,72 @@ class _Recorded:
     def __init__(self, kernel: wp.Kernel, arguments: list[Any], device: str) -> None:
         self._kernel, self._arguments, self._device = kernel, arguments, device
         self._places = [k for k, argument in enumerate(arguments) if not _is_held(argument)]
-        self._commands: dict[tuple[int, int], tuple[_Command, list[Any]]] = {}
+        self._commands: dict[tuple[int, int], _Command] = {}
+        self._plans: dict[tuple[int, int], _Plan] = {}
 
     def launch(self, begin: int, end: int, numbers: list[Any]) -> None:
         """`numbers` are the arguments that are no arrays or structs, in order."""
-        found = self._commands.get((begin, end))
-        if found is None:
+        self._command(begin, end, numbers).launch()
+
+    def spread(self, count: int, pieces: int, numbers: list[Any]) -> None:
+        """Launch over `count` indices in `pieces` ranges, which threads of the CPU take as they come free."""
+        bounds = [count * i // pieces for i in range(pieces + 1)]
+        commands = [self._command(a, b, numbers) for a, b in itertools.pairwise(bounds)]
+        plan = self._plans.get((count, pieces))
+        if plan is None:
+            plan = self._plans[count, pieces] = _Plan(commands)
+        plan.run()
+
+    def _command(self, begin: int, end: int, numbers: list[Any]) -> _Command:
+        """The launch over a range, with these numbers."""
+        command = self._commands.get((begin, end))
+        if command is None:
             arguments = list(self._arguments)
             for place, number in zip(self._places, numbers, strict=True):
                 arguments[place] = number
-            command = _Command(
-                wp.launch(
-                    self._kernel,
-                    dim=end - begin,
-                    inputs=[begin, *arguments],
-                    device=self._device,
-                    record_cmd=True,
-                )
+            recorded = wp.launch(
+                self._kernel,
+                dim=end - begin,
+                inputs=[begin, *arguments],
+                device=self._device,
+                record_cmd=True,
             )
-            self._commands[begin, end] = (command, list(numbers))
+            command = self._commands[begin, end] = _Command(recorded, list(numbers))
         else:
-            command, known = found
+            known = command.numbers
             for k, number in enumerate(numbers):
                 if known[k] is not number and known[k] != number:
                     command.put(self._places[k] + 1, number)
                     known[k] = number
-        command.launch()
+        return command
+
+
+class _Plan:
+    """Recorded launches of one kernel on the CPU, run side by side by several threads."""
+
+    def __init__(self, commands: list[_Command]) -> None:
+        addresses = np.array([command.addresses() for command in commands], np.uint64)
+        self._counter: wp.array = wp.zeros(1, dtype=int, device="cpu")
+        self._next = self._counter.numpy()
+        self._pieces = len(commands)
+        arrays: list[wp.array] = [wp.array(a, dtype=wp.uint64, device="cpu") for a in addresses.T.copy()]
+        inputs = [len(commands), commands[0].function(), *arrays, self._counter]
+        self._held = (commands, arrays)
+        self._runner = _Command(
+            wp.launch(run_pieces, dim=1, inputs=inputs, device="cpu", record_cmd=True), []
+        )
+
+    def run(self) -> None:
+        """Returns when all pieces have ended."""
+        self._next[0] = 0
+        threads = min(thread_count(), self._pieces)
+        futures = [_workers().submit(self._runner.launch) for _ in range(1, threads)]
+        try:
+            self._runner.launch()
+        finally:
+            wait(futures)
+        for future in futures:
+            future.result()
 
 
 class _Command:
@@ -315,8 +363,8 @@ class _Command:
     `wp.Launch.launch` puts them there anew at every launch, which takes longer than a small kernel runs.
     """
 
-    def __init__(self, command: wp.Launch) -> None:
-        self._command = command
+    def __init__(self, command: wp.Launch, numbers: list[Any]) -> None:
+        self._command, self.numbers = command, numbers
         self._direct = command.device.is_cpu and command.block_dim <= 1
         if not self._direct:
             return
@@ -335,6 +383,14 @@ class _Command:
         self._command.set_param_at_index(index, value)
         if self._direct:
             setattr(self._arguments, self._names[index], self._command.params[index + 1])
+
+    def function(self) -> int:
+        """Address of the compiled kernel, on a CPU."""
+        return ctypes.cast(self._call, ctypes.c_void_p).value or 0
+
+    def addresses(self) -> tuple[int, int]:
+        """Those of its bounds and arguments, on a CPU."""
+        return ctypes.addressof(self._command.params[0]), ctypes.addressof(self._arguments)
 
     def launch(self) -> None:
         if self._direct:

@@ -40,7 +40,8 @@ def largest_step(material: Material, spacing: float) -> float:
     """Longest substep that explicit viscosity is stable with on a grid of that spacing, s; inf: any.
 
     A particle without neighbours feels all three directions at once where it swells: its volume answers with
-    3 lambda + 2 mu, more than the lambda + 2 mu of waves. The yielding of "herschel_bulkley" is implicit, and asks for none.
+    3 lambda + 2 mu, more than the lambda + 2 mu of waves. The yielding of "herschel_bulkley" is implicit, and
+    asks for none.
     """
     lam, mu = material.lame
     viscosity = material.rayleigh_stiffness * (3.0 * lam + 2.0 * mu)
