@@ -55,6 +55,11 @@ class BoundGaussians:
     def device(self) -> torch.device:
         return self.vertices.device
 
+    @property
+    def is_loose(self) -> bool:
+        """Whether no two triangles share a vertex: a cloud that had no mesh, or a body cut up."""
+        return len(self.faces) > 3 and int(self.faces.unique().numel()) == self.faces.numel()
+
     def to(self, device: str | torch.device) -> BoundGaussians:
         """The same Gaussians with every tensor on `device`."""
         return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})

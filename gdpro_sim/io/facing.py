@@ -19,7 +19,7 @@ class Facing:
     """
 
     def __init__(self, bodies: Sequence[BoundGaussians], cameras: Cameras) -> None:
-        self._bodies = [(bound, _loose(bound)) for bound in bodies]
+        self._bodies = [(bound, bound.is_loose) for bound in bodies]
         self._eye = cameras.positions[0]
 
     def normals(self, vertices: Sequence[np.ndarray]) -> torch.Tensor:
@@ -34,11 +34,6 @@ class Facing:
                 normals = torch.where(away, -normals, normals)
             found.append(normals)
         return torch.cat(found)
-
-
-def _loose(bound: BoundGaussians) -> bool:
-    faces = bound.faces.cpu().numpy()
-    return len(np.unique(faces)) == faces.size
 
 
 __all__ = ["Facing"]

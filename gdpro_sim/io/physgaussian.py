@@ -97,6 +97,8 @@ def _read(config: str | Path) -> dict[str, Any]:
         raise RequestError(f"{config}: cannot be read as JSON: {error}") from None
     if not isinstance(data, dict):
         raise RequestError(f"{config}: a configuration is a mapping, got {type(data).__name__}")
+    if not KEYS & data.keys():
+        raise RequestError(f"{config}: holds none of the keys of a PhysGaussian configuration")
     return data
 
 
@@ -253,7 +255,8 @@ class _Conversion:
     def camera(self) -> dict[str, Any]:
         view: dict[str, Any] = {"target": self.point(self.data.get("mpm_space_viewpoint_center", MIDDLE))}
         if self.data.get("default_camera_index", 0) != -1:
-            self.say("`default_camera_index`: the cloud's own cameras are not read")
+            if "default_camera_index" in self.data:
+                self.say("`default_camera_index`: the cloud's own cameras are not read")
             return view
         for key, name in (("azimuth", "init_azimuthm"), ("elevation", "init_elevation")):
             if self.data.get(name) is not None:

@@ -166,7 +166,7 @@ def fill_bound(
     See `fill_mesh` and `fill_splats`.
     """
     faces = bound.faces.cpu().numpy()
-    if len(faces) > 3 and len(np.unique(faces)) == faces.size:
+    if bound.is_loose:
         return fill_splats(bound.to("cpu").gaussians(), spacing, pattern=pattern, seed=seed)
     return fill_mesh(bound.vertices.detach().cpu().numpy(), faces, spacing, pattern=pattern, seed=seed)
 

@@ -89,6 +89,12 @@ def load_assets(
                 seed=scene.seed,
                 on_progress=tell,
             )
+        if asset.gaussians.is_loose and not isinstance(scene.solver, MpmOptions):
+            raise SceneError(
+                f"{scene.name}: body {body.name!r}: {path.name} is a splat cloud without a mesh, which only "
+                "MPM can simulate (`solver: {kind: mpm}`); `gdpro generate --from-splat` makes an asset with "
+                "a mesh"
+            )
         if isinstance(scene.solver, MujocoOptions):
             asset = prepare(body, asset, tell)
         if asset.tets is None and fem:

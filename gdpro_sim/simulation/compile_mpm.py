@@ -20,6 +20,7 @@ from gdpro_sim.simulation.compile_forces import Placed, chosen_pins, compile_pus
 from gdpro_sim.simulation.conditions import FOREVER, Hold, Load
 from gdpro_sim.simulation.forces import Pin
 from gdpro_sim.simulation.model import Body, Ground, Model, MpmSettings, Particles
+from gdpro_sim.simulation.mpm.matter import flows
 from gdpro_sim.simulation.placement import Placement, material_of, place
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.solver_options import MpmOptions
@@ -63,6 +64,11 @@ def compile_particles(
         volumes = filling.volumes.astype(np.float64)
         count = len(filling)
         parts = [part.material for part in body.parts]
+        if options.integrator == "implicit" and any(flows(item) for item in (material, *parts)):
+            raise SceneError(
+                f"{where}: its material flows, yields or tears, which the implicit integrator cannot do; use "
+                "`integrator: explicit`"
+            )
         numbers = [materials.setdefault(item, len(materials)) for item in (material, *parts)]
         matter = np.full(count, numbers[0], np.int32)
         chosen = Placed(scene, body.name, points, begin, "particle")

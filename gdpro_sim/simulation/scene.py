@@ -343,6 +343,11 @@ def load_scene(scene: str | Path) -> Scene:
         if str(scene) not in names:
             near = difflib.get_close_matches(str(scene), names, n=1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
+            if path.is_file():
+                raise SceneError(
+                    f"{path} is neither a scene (.yaml) nor an asset; if it is a mesh, make one of it: gdpro "
+                    f"import {path} -o {path.stem}.usdc"
+                )
             raise SceneError(
                 f"no scene {str(scene)!r}{hint}; give a .yaml file or one of: {', '.join(names)}"
             )

@@ -177,7 +177,7 @@ def _of_nodes(
         raise SceneError(
             f"body {body.name!r}: its pins are smaller than a cell of the {body.reduction} grid of "
             f"{list(body.cells)} cells, which can hold none of its nodes; give more `cells`, larger pins, or "
-            "`as: full`"
+            "`form: full`"
         )
     moved = np.full(weights.shape[1], -1)
     for k in range(len(body.motions)):
