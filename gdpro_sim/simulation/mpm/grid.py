@@ -34,7 +34,7 @@ def _row_length(count: int) -> int:
 FARTHEST = 1 << 21
 """Cells from the origin at which float32 tells no eighth of a cell apart any more."""
 
-FEW_BLOCKS = 16
+FEW_BLOCKS = 48
 """Blocks of particles worth a range of their own among threads."""
 
 WIDTHS = {"quadratic": 3, "cubic": 4}
@@ -209,7 +209,7 @@ class Grid:
                 self.count,
                 [self.width, gravity, self.sources, self.tiles],
                 [self.values],
-                minimum=64,
+                minimum=4 * FEW_BLOCKS,
             )
             return
         self.values.zero_()

@@ -237,7 +237,7 @@ class SolverMPM:
             mpm_laws.groups(len(grid.ids), grid.device),
             [float(h), grid.matter, self.matter.table],
             [grid.particles],
-            minimum=64,
+            minimum=512,
         )
 
     def surface_positions(self, body: int) -> np.ndarray:
