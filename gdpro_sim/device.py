@@ -351,8 +351,11 @@ class _Plan:
         futures = [_workers().submit(self._runner.launch) for _ in range(1, threads)]
         try:
             self._runner.launch()
-        finally:
             wait(futures)
+        except BaseException:
+            self._next[0] = self._pieces  # leave nothing to begin
+            wait(futures)  # an interrupt ends the wait above
+            raise
         for future in futures:
             future.result()
 

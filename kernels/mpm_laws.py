@@ -54,12 +54,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from gdpro_sim.kernels import particles as rows
-from gdpro_sim.kernels.decomposition import singular_value_decomposition
 from gdpro_sim.kernels.elasticity import COROTATED, NEO_HOOKEAN, STABLE_NEO_HOOKEAN, STVK_HENCKY
 from gdpro_sim.kernels.lane_math import LANE_MATH
-from gdpro_sim.kernels.lanes import CPU_FLAGS, PRELUDE
-from gdpro_sim.kernels.particles import DEFORMATION, DEFORMATION_LOW, read_compensated, write_compensated
+from gdpro_sim.kernels.lanes import CPU_FLAGS
+from gdpro_sim.kernels.mpm_groups import GROUP, LANES, degenerate_lanes, first_of_group, recover
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 
@@ -67,9 +65,6 @@ DRUCKER_PRAGER = wp.constant(5)
 SNOW = wp.constant(6)
 HERSCHEL_BULKLEY = wp.constant(7)
 FLUID = wp.constant(8)
-
-LANES = 16
-"""Particles of a group on a CPU."""
 
 # Columns of the table of materials, one row each; what A, B and C are belongs to the law.
 LAW = wp.constant(0)
@@ -87,10 +82,6 @@ B = wp.constant(11)  # cone's tip, volume strain | theta_s | flow index
 C = wp.constant(12)  # log J over which cohesion is lost | xi
 COLUMNS = wp.constant(13)
 
-FLAT = wp.constant(wp.float64(0.05))
-"""Singular values of a recovered deformation gradient are at least this."""
-
-
 PACKING = (10.0, 0.02)
 """Where a fluid's particles have clumped, J falls towards the grid's ratio of volumes and this much more, at
 this rate, 1/s: else J, which is integrated along the particles, would drift from where they are."""
@@ -107,13 +98,6 @@ def groups(count: int, device: str) -> int:
 _CONSTANTS = "".join(
     f"    const int {name} = {int(value)};\n"
     for name, value in {
-        **{
-            name: getattr(rows, name)
-            for name in (
-                "VELOCITY", "AFFINE", "DEFORMATION", "DEFORMATION_LOW", "STRESS", "VOLUME", "SPEED",
-                "INTERNAL", "DENSITY",
-            )
-        },
         "STABLE_NEO_HOOKEAN": STABLE_NEO_HOOKEAN,
         "NEO_HOOKEAN": NEO_HOOKEAN,
         "COROTATED": COROTATED,
@@ -138,92 +122,6 @@ _CONSTANTS = "".join(
         "COLUMNS": COLUMNS,
     }.items()
 )  # fmt: skip
-
-_GROUP = f"""
-{_CONSTANTS}
-    const int count = (int)matter.shape[0];
-#if defined(__CUDACC__)
-    const int first = group, lanes = 1;
-#else
-    const int first = group * {LANES}, lanes = count - first < {LANES} ? count - first : {LANES};
-#endif
-    {PRELUDE}
-#if defined(__CUDACC__)
-    typedef double D;
-    auto wide = [](F v) {{ return (double)v; }};
-    auto narrow = [](D v) {{ return (float)v; }};
-    auto row = [&](int r) {{ return particles.data[(size_t)r * particles.shape[1] + first]; }};
-    auto put = [&](int r, F v) {{ particles.data[(size_t)r * particles.shape[1] + first] = v; }};
-#else
-    typedef double D __attribute__((ext_vector_type({LANES})));
-    auto wide = [](F v) {{ return __builtin_convertvector(v, D); }};
-    auto narrow = [](D v) {{ return __builtin_convertvector(v, F); }};
-    auto row = [&](int r) {{
-        const float* const p = particles.data + (size_t)r * particles.shape[1] + first;
-        F v;
-        if (lanes == {LANES}) {{ __builtin_memcpy(&v, p, sizeof(F)); return v; }}
-        for (int j = 0; j < {LANES}; ++j) v[j] = p[j < lanes ? j : lanes - 1];
-        return v;
-    }};
-    auto put = [&](int r, F v) {{
-        float* const p = particles.data + (size_t)r * particles.shape[1] + first;
-        if (lanes == {LANES}) {{ __builtin_memcpy(p, &v, sizeof(F)); return; }}
-        for (int j = 0; j < lanes; ++j) p[j] = v[j];
-    }};
-#endif
-"""
-"""Opens a snippet: rows of a group's particles, and double vectors D."""
-
-_DEGENERATE = f"""
-{_GROUP}
-    F f[9];
-    for (int i = 0; i < 9; ++i) f[i] = row(DEFORMATION + i);
-    const F J = f[0] * (f[4] * f[8] - f[5] * f[7]) - f[1] * (f[3] * f[8] - f[5] * f[6])
-        + f[2] * (f[3] * f[7] - f[4] * f[6]);
-    const I flat = J < 0.01f;
-    if (!any(flat)) return 0;
-#if defined(__CUDACC__)
-    return 1;
-#else
-    int mask = 0;
-    for (int j = 0; j < lanes; ++j) if (flat[j]) mask |= 1 << j;
-    return mask;
-#endif
-"""
-
-
-@wp.func_native(_DEGENERATE)
-def degenerate_lanes(group: int, matter: wp.array[wp.int32], particles: wp.array2d[float]) -> int:
-    """Bit j is set where the deformation gradient of a group's particle j has J < 0.01."""
-    ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDACC__)
-    return group;
-#else
-    return group * {LANES};
-#endif
-""")
-def first_of_group(group: int) -> int:
-    """Number of a group's first particle."""
-    ...
-
-
-@wp.func
-def recover(i: int, particles: wp.array2d[float]):
-    """Raise the singular values of a particle's deformation gradient to `FLAT`."""
-    F = read_compensated(particles, DEFORMATION, DEFORMATION_LOW, i)
-    G = FLAT * wp.identity(n=3, dtype=wp.float64)
-    if wp.ddot(F, F) > wp.float64(1.0e-12):
-        U, s, V = singular_value_decomposition(F)
-        G = (
-            U
-            * wp.diag(wp.vec3d(wp.max(s[0], FLAT), wp.max(s[1], FLAT), wp.max(s[2], FLAT)))
-            * wp.transpose(V)
-        )
-    write_compensated(G, DEFORMATION, DEFORMATION_LOW, i, particles)
-
 
 _BEGIN = """
     // Materials.
@@ -556,7 +454,8 @@ _END = """
 """
 
 _UPDATE = f"""
-{_GROUP}
+{GROUP}
+{_CONSTANTS}
 #define PRODUCT(v) (v[0] + v[1] + v[2] + v[0] * v[1] + v[0] * v[2] + v[1] * v[2] + v[0] * v[1] * v[2])
 #define LOOSE {LOOSE}f
 #define PACKING {PACKING[0]}f

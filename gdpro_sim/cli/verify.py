@@ -1,8 +1,9 @@
-"""Problems with known answers: `gdpro verify fem`, `gdpro verify mpm`."""
+"""Problems with known answers: `gdpro verify fem`, `gdpro verify mpm`, `gdpro verify mujoco`."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -22,46 +23,32 @@ Quick = Annotated[bool, typer.Option("--quick", help="Leave out the slow problem
 QUANTITY_WIDTH = 68
 
 
-@verify.command()
-def fem(
-    only: Only = None,
-    listing: Listing = False,
-    quick: Quick = False,
-    json_output: AsJson = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
-) -> None:
-    """Elements, materials, beams, vibrations, energy, contact, friction, robustness of the FEM solver."""
-    setup(quiet, debug)
-    _verify("fem", only or [], listing, quick, json_output, quiet)
+ABOUT = {
+    "fem": "Elements, materials, beams, vibrations, energy, contact, friction, robustness of FEM.",
+    "mpm": "Materials, transfers, momenta, vibration, impact, fluids, sand, friction, equal bytes of MPM.",
+    "mujoco": "Inertia, friction, restitution, hinges, rest, flexes and exact states in MuJoCo.",
+}
 
 
-@verify.command()
-def mpm(
-    only: Only = None,
-    listing: Listing = False,
-    quick: Quick = False,
-    json_output: AsJson = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
-) -> None:
-    """Materials, transfers, momenta, vibration, impact, fluids, sand, friction, reproducibility of MPM."""
-    setup(quiet, debug)
-    _verify("mpm", only or [], listing, quick, json_output, quiet)
+def _command(solver: str) -> Callable[..., None]:
+    """The command of one solver, added."""
+
+    @verify.command(solver, help=ABOUT[solver])
+    def run(
+        only: Only = None,
+        listing: Listing = False,
+        quick: Quick = False,
+        json_output: AsJson = False,
+        quiet: Quiet = False,
+        debug: Debug = False,
+    ) -> None:
+        setup(quiet, debug)
+        _verify(solver, only or [], listing, quick, json_output, quiet)
+
+    return run
 
 
-@verify.command()
-def mujoco(
-    only: Only = None,
-    listing: Listing = False,
-    quick: Quick = False,
-    json_output: AsJson = False,
-    quiet: Quiet = False,
-    debug: Debug = False,
-) -> None:
-    """Inertia, friction, restitution, hinges, rest, flexes and exact states in MuJoCo."""
-    setup(quiet, debug)
-    _verify("mujoco", only or [], listing, quick, json_output, quiet)
+COMMANDS = {solver: _command(solver) for solver in ABOUT}
 
 
 def _verify(solver: str, only: list[str], listing: bool, quick: bool, json_output: bool, quiet: bool) -> None:
@@ -88,7 +75,8 @@ def _verify(solver: str, only: list[str], listing: bool, quick: bool, json_outpu
         checks = sum(len(result.checks) for result in results)
         seconds = sum(result.seconds for result in results)
         end = f"failed: {', '.join(failed)}" if failed else "all pass"
-        print(f"{len(results)} problems, {checks} checks, {seconds:.0f} s: {end}")
+        counted = "1 problem" if len(results) == 1 else f"{len(results)} problems"
+        print(f"{counted}, {checks} checks, {seconds:.0f} s: {end}")
     if failed:
         raise typer.Exit(1)
 

@@ -11,7 +11,8 @@ from gdpro_sim.files import prepare_folder
 from gdpro_sim.generation.config import load_config
 from gdpro_sim.io.generate import Request, generate_run
 from gdpro_sim.io.sources import Inputs
-from gdpro_sim.simulation.scene import Scene, SceneBody
+from gdpro_sim.simulation.scene import Scene
+from gdpro_sim.simulation.scene_body import SceneBody
 
 
 def with_generated(

@@ -13,7 +13,7 @@ from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.meshing.surface import SurfaceMesh
 from gdpro_sim.simulation.colliders import Collider
-from gdpro_sim.simulation.conditions import pose_at
+from gdpro_sim.simulation.conditions import Motion, pose_at
 
 COLOR = (0.60, 0.63, 0.67)
 BUDGET = 12_000
@@ -83,7 +83,7 @@ def with_obstacles(
         points = _surface(collider, low, high)[0] @ collider.rotation.T + collider.position
         if np.linalg.norm(np.ptp(points, axis=0)) > LARGE * size:
             continue
-        for time in (0.0,) if collider.motion is None else collider.motion.times.tolist():
+        for time in collider.motion.times.tolist() if isinstance(collider.motion, Motion) else (0.0,):
             moved = points
             if collider.motion is not None:
                 rotation, shift = pose_at(collider.motion, time)

@@ -42,7 +42,8 @@ from gdpro_sim.simulation.compile import check_files, load_assets
 from gdpro_sim.simulation.model import Diagnostics
 from gdpro_sim.simulation.placement import material_of
 from gdpro_sim.simulation.run import Simulation
-from gdpro_sim.simulation.scene import Scene, SceneBody, load_scene
+from gdpro_sim.simulation.scene import Scene, load_scene
+from gdpro_sim.simulation.scene_body import SceneBody
 
 Progress = Callable[[str, int, int], None]
 """Called with (phase, done, total); total 0 means the length is not known."""

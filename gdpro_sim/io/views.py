@@ -22,7 +22,8 @@ from gdpro_sim.io.turntable import studio_around, turntable_cameras
 from gdpro_sim.io.usd import SimulationReader
 from gdpro_sim.simulation.colliders import compile_collider
 from gdpro_sim.simulation.frame import Frame
-from gdpro_sim.simulation.scene import Camera, Scene
+from gdpro_sim.simulation.scene import Scene
+from gdpro_sim.simulation.view import Camera
 
 logger = logging.getLogger(__name__)
 

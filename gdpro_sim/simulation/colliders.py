@@ -15,7 +15,7 @@ from gdpro_sim.errors import MeshError
 from gdpro_sim.meshing.load import load_mesh
 from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.repair import face_normals, validate
-from gdpro_sim.simulation.conditions import FOREVER, Motion
+from gdpro_sim.simulation.conditions import FOREVER, Guide, Motion
 from gdpro_sim.simulation.motions import Moving
 from gdpro_sim.simulation.options import Number, Vector
 
@@ -186,7 +186,7 @@ class Collider:
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     friction: float | None = None
-    motion: Motion | None = None
+    motion: Motion | Guide | None = None
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
     boundary: BoundaryKind = "separate"

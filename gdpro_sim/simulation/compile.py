@@ -20,7 +20,8 @@ from gdpro_sim.simulation.compile_mujoco import compile_mujoco, prepare
 from gdpro_sim.simulation.model import Body, Ground, Model
 from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.placement import material_of, place
-from gdpro_sim.simulation.scene import Scene, SceneBody
+from gdpro_sim.simulation.scene import Scene
+from gdpro_sim.simulation.scene_body import SceneBody
 from gdpro_sim.simulation.solver_options import MpmOptions
 
 

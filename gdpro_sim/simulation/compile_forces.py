@@ -16,7 +16,8 @@ from gdpro_sim.simulation.conditions import FOREVER, Force, Impulse, Load, Motio
 from gdpro_sim.simulation.forces import Attachment, Pin, Spring, SpringEnd
 from gdpro_sim.simulation.model import Body, Model
 from gdpro_sim.simulation.regions import Region
-from gdpro_sim.simulation.scene import Scene, SceneBody
+from gdpro_sim.simulation.scene import Scene
+from gdpro_sim.simulation.scene_body import SceneBody
 
 END_OUTSIDE = 0.05
 """A spring's end may lie this much outside its body, as a fraction of the body's size."""

@@ -36,7 +36,8 @@ from gdpro_sim.simulation.mujoco_model import (
 )
 from gdpro_sim.simulation.mujoco_options import MujocoBody, MujocoOptions
 from gdpro_sim.simulation.placement import Placement, material_of, place
-from gdpro_sim.simulation.scene import Scene, SceneBody
+from gdpro_sim.simulation.scene import Scene
+from gdpro_sim.simulation.scene_body import SceneBody
 
 log = logging.getLogger(__name__)
 

@@ -35,8 +35,40 @@ class Motion:
     rotations: np.ndarray
 
 
-def pose_at(motion: Motion, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3] m at a time: x = rotation X + translation of what started at X."""
+Pose = tuple[np.ndarray, np.ndarray]
+"""Rotation [3, 3] and translation [3] m: x = rotation X + translation of what started at X."""
+
+
+class Guide:
+    """A rigid motion that is told from step to step: another solver moves what follows it.
+
+    Before it is told anything, and outside the time it was told of, it stands still.
+    centre: [3] m at the start, of what moves; it goes straight while the rest turns about it
+    """
+
+    def __init__(self, centre: np.ndarray) -> None:
+        self.centre = centre
+        self._times = (0.0, 0.0)
+        self._poses: tuple[Pose, Pose] = ((np.eye(3), np.zeros(3)), (np.eye(3), np.zeros(3)))
+
+    def tell(self, start: float, end: float, before: Pose, after: Pose) -> None:
+        """From `start` to `end` s it goes from one pose to another, evenly, its turn the shortest way."""
+        self._times, self._poses = (start, end), (before, after)
+
+    def pose(self, time: float) -> Pose:
+        """Where it is at a time in s."""
+        (start, end), ((turn, shift), (turned, shifted)) = self._times, self._poses
+        share = float(np.clip((time - start) / (end - start), 0.0, 1.0)) if end > start else 1.0
+        way = Rotation.from_matrix(turned @ turn.T).as_rotvec()
+        now: np.ndarray = Rotation.from_rotvec(share * way).as_matrix() @ turn
+        centre = (1.0 - share) * (turn @ self.centre + shift) + share * (turned @ self.centre + shifted)
+        return now, centre - now @ self.centre
+
+
+def pose_at(motion: Motion | Guide, time: float) -> Pose:
+    """Where a motion is at a time in s."""
+    if isinstance(motion, Guide):
+        return motion.pose(time)
     times = motion.times
     k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
     shift, turn = motion.translations[k], Rotation.from_rotvec(motion.rotations[k])
@@ -131,4 +163,17 @@ class Wind:
 
 Load = Force | Impulse | Pressure | Wind
 
-__all__ = ["FOREVER", "Force", "Hold", "Impulse", "Load", "Motion", "Pressure", "Springs", "Wind", "pose_at"]
+__all__ = [
+    "FOREVER",
+    "Force",
+    "Guide",
+    "Hold",
+    "Impulse",
+    "Load",
+    "Motion",
+    "Pose",
+    "Pressure",
+    "Springs",
+    "Wind",
+    "pose_at",
+]

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from gdpro_sim.asset import Asset
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
-from gdpro_sim.simulation.scene import Scene, SceneBody
+from gdpro_sim.simulation.scene import Scene
+from gdpro_sim.simulation.scene_body import SceneBody
 
 FALLBACK_MATERIAL = "jelly"
 

@@ -8,27 +8,19 @@ import importlib.util
 import logging
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from gdpro_sim.errors import SceneError
-from gdpro_sim.materials import Material
 from gdpro_sim.simulation.colliders import BoundaryKind, ColliderOptions, MeshCollider
-from gdpro_sim.simulation.forces import (
-    AirFlow,
-    Attachment,
-    ConstantForce,
-    Pin,
-    Push,
-    Spring,
-    SurfacePressure,
-)
-from gdpro_sim.simulation.mujoco_options import MujocoBody, MujocoOptions
+from gdpro_sim.simulation.forces import AirFlow, Attachment, Spring
+from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.options import Options, Vector, several
-from gdpro_sim.simulation.regions import Region
+from gdpro_sim.simulation.scene_body import SceneBody
 from gdpro_sim.simulation.solver_options import FemOptions, SolverOptions
+from gdpro_sim.simulation.view import Camera, Render
 
 if TYPE_CHECKING:
     from gdpro_sim.asset import Asset
@@ -39,89 +31,6 @@ STIFFEST = 1.0e7
 """Young's modulus in Pa to which `drop_scene` limits materials."""
 
 
-class Part(Region):
-    """Part of a body that is made of something else."""
-
-    material: Material = Field(description="preset name or values")
-
-
-class SceneBody(Options):
-    """One soft body."""
-
-    name: str = Field(
-        default="", pattern=r"^([A-Za-z_][A-Za-z0-9_]*)?$", description="unique; default: from the file"
-    )
-    asset: str = Field(
-        default="",
-        description="asset (.usdc, .usda, .usdz) or mesh file, relative to the scene file; "
-        "`package:NAME/PATH` is a file inside an installed Python package",
-    )
-    prompt: str | None = Field(
-        default=None, min_length=1, description="in place of `asset`: words to generate one from"
-    )
-    quality: Literal["draft", "default", "high"] = Field(
-        default="default", description="of what a prompt generates"
-    )
-    color: str | None = Field(default=None, description="colour of a mesh, #rrggbb or a CSS name")
-    texture: str | None = Field(
-        default=None, description="texture image of a mesh, relative to the scene file"
-    )
-    budget: int = Field(
-        default=50_000, ge=100, le=5_000_000, description="Gaussians to aim for when a mesh is bound"
-    )
-    up: Literal["auto", "y", "z"] = Field(default="auto", description="up axis of a mesh file")
-    tets: int = Field(
-        default=6_000, ge=50, le=500_000, description="tetrahedra to aim for, where none are cached; roughly"
-    )
-    particles: int | None = Field(
-        default=None, ge=1, le=20_000_000, description="of MPM to aim for; default: the solver's, by volume"
-    )
-    size: float | None = Field(default=None, gt=0.0, description="longest side of the bounding box, m")
-    scale: float = Field(default=1.0, gt=0.0, description="uniform scale, where size is not given")
-    anchor: Literal["bottom", "center", "origin"] = Field(
-        default="bottom", description="which point of the turned body `position` places"
-    )
-    position: Vector = Field(default=(0.0, 0.0, 0.0), description="m")
-    rotation: Vector = Field(default=(0.0, 0.0, 0.0), description="degrees about X, then Y, then Z")
-    velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="m/s")
-    angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="rad/s about the body's centre")
-    material: Material | None = Field(
-        default=None, description="preset name or values; default: the asset's, else jelly"
-    )
-    parts: tuple[Part, ...] = Field(
-        default=(), description="parts of another material, MPM; the last that holds a particle counts"
-    )
-    pins: tuple[Pin, ...] = Field(default=(), description="parts held in place, or moved along keyframes")
-    forces: tuple[ConstantForce, ...] = Field(default=(), description="constant forces on parts of it")
-    impulses: tuple[Push, ...] = Field(default=(), description="pushes at a time")
-    pressures: tuple[SurfacePressure, ...] = Field(default=(), description="on parts of its surface")
-
-    mujoco: MujocoBody | None = Field(default=None, description="what it is to the MuJoCo solver")
-
-    @field_validator("parts", "pins", "forces", "impulses", "pressures", mode="before")
-    @classmethod
-    def _several(cls, value: Any) -> Any:
-        return () if value is None else several(value)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _name_from_file(cls, value: Any) -> Any:
-        if isinstance(value, dict) and not value.get("name"):
-            source = value.get("asset") or value.get("prompt")
-            if not isinstance(source, str):
-                return value
-            stem = Path(source).stem if value.get("asset") else source.strip()
-            safe = "".join(ch if ch.isascii() and ch.isalnum() else "_" for ch in stem)
-            value = {**value, "name": safe if safe[:1].isalpha() else f"body_{safe}"}
-        return value
-
-    @model_validator(mode="after")
-    def _one_source(self) -> SceneBody:
-        if bool(self.asset) == (self.prompt is not None):
-            raise ValueError("give either `asset` (a file) or `prompt` (words), one of the two")
-        return self
-
-
 class GroundPlane(Options):
     """The floor z = height."""
 
@@ -130,40 +39,6 @@ class GroundPlane(Options):
         default="separate",
         description="separate (rubs by the bodies' friction), slip or sticky. MPM; FEM knows only separate",
     )
-
-
-class Camera(Options):
-    """The preview's camera. Anything left out is chosen so that the bodies and their fall fit the picture."""
-
-    eye: Vector | None = Field(default=None, description="m")
-    target: Vector | None = Field(default=None, description="m")
-    azimuth: float = Field(default=-60.0, description="degrees from +X, where eye is not given")
-    elevation: float = Field(default=14.0, ge=-89.0, le=89.0, description="degrees, where eye is not given")
-    fov: float = Field(default=32.0, gt=1.0, lt=150.0, description="vertical field of view, degrees")
-    width: int = Field(default=960, ge=16, le=8192, description="pixels; even, for video")
-    height: int = Field(default=720, ge=16, le=8192, description="pixels; even, for video")
-
-    @model_validator(mode="after")
-    def _apart(self) -> Camera:
-        if self.eye is not None and self.eye == self.target:
-            raise ValueError(f"eye and target coincide at {list(self.eye)}")
-        return self
-
-    @field_validator("width", "height")
-    @classmethod
-    def _even(cls, value: int) -> int:
-        if value % 2:
-            raise ValueError(f"must be even (H.264 video), got {value}")
-        return value
-
-
-class Render(Options):
-    """How the preview looks."""
-
-    shading: Literal["studio", "none"] = Field(
-        default="studio", description="studio lights and shadows, or raw colours"
-    )
-    background: Literal["studio", "white", "black"] = "studio"
 
 
 class Scene(Options):
@@ -467,12 +342,8 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 __all__ = [
-    "Camera",
     "GroundPlane",
-    "Part",
-    "Render",
     "Scene",
-    "SceneBody",
     "check_scene",
     "drop_scene",
     "load_scene",

@@ -21,7 +21,8 @@ from gdpro_sim.simulation.forces import (
     SurfacePressure,
 )
 from gdpro_sim.simulation.motions import Keyframe
-from gdpro_sim.simulation.scene import Scene, SceneBody, check_scene, load_scene, scene_names
+from gdpro_sim.simulation.scene import Scene, check_scene, load_scene, scene_names
+from gdpro_sim.simulation.scene_body import SceneBody
 
 MINIMAL = "bodies:\n  - asset: thing.obj\n"
 

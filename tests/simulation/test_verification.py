@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import typer
 
-from gdpro_sim.cli.verify import fem, mpm
+from gdpro_sim.cli.verify import COMMANDS
 from gdpro_sim.errors import RequestError, SolverError
 from gdpro_sim.simulation.verification import SOLVERS, problems
 from gdpro_sim.simulation.verification import fem as suite
@@ -135,22 +135,22 @@ def test_the_command_prints_figures_and_passes() -> None:
 
 
 def test_the_command_lists_and_speaks_json(capsys: pytest.CaptureFixture[str]) -> None:
-    fem(listing=True)
+    COMMANDS["fem"](listing=True)
     listed = capsys.readouterr().out
     assert "elastica" in listed and "long-run" in listed
-    fem(listing=True, quick=True)
+    COMMANDS["fem"](listing=True, quick=True)
     assert "long-run" not in capsys.readouterr().out
-    fem(only=["patch"], json_output=True)
+    COMMANDS["fem"](only=["patch"], json_output=True)
     summary = json.loads(capsys.readouterr().out)
     assert summary["passed"] and list(summary["problems"]) == ["patch"]
     assert {"quantity", "expected", "measured", "error", "bound", "passed"} <= set(summary["checks"][0])
 
 
 def test_the_command_takes_mpm(capsys: pytest.CaptureFixture[str]) -> None:
-    mpm(listing=True)
+    COMMANDS["mpm"](listing=True)
     listed = capsys.readouterr().out
     assert "dam-break" in listed and "(slow)" in listed
-    mpm(only=["fluid"])
+    COMMANDS["mpm"](only=["fluid"])
     assert "Monaghan 1994" in capsys.readouterr().out
 
 
@@ -160,7 +160,7 @@ def test_the_command_fails_where_a_problem_fails(
     wrong = Problem("wrong", "One is two", "nowhere", lambda: [relative("one", 2.0, 1.0, 0.1)])
     monkeypatch.setattr(suite, "PROBLEMS", (wrong,))
     with pytest.raises(typer.Exit) as left:
-        fem(quiet=True)
+        COMMANDS["fem"](quiet=True)
     assert left.value.exit_code == 1
     printed = capsys.readouterr().out
     assert "FAIL" in printed and "One is two" in printed
@@ -168,7 +168,7 @@ def test_the_command_fails_where_a_problem_fails(
 
 def test_an_unknown_problem_is_refused() -> None:
     with pytest.raises(RequestError, match="no problem is called 'nonsense'"):
-        fem(only=["nonsense"])
+        COMMANDS["fem"](only=["nonsense"])
 
 
 def test_the_reference_agrees_with_its_own_derivatives() -> None:

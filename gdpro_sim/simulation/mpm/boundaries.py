@@ -19,7 +19,7 @@ import warp as wp
 
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import mpm_boundary as kernels
-from gdpro_sim.kernels import mpm_drivers
+from gdpro_sim.kernels import mpm_drivers, mpm_gaps
 from gdpro_sim.kernels.mpm_transfer import tile_width
 from gdpro_sim.simulation.collider_shapes import KINDS as COLLIDER_KINDS
 from gdpro_sim.simulation.collider_shapes import ColliderShape, placed
@@ -257,13 +257,13 @@ class Obstacles:
         middle = NODES_REACH if reach == NODES_REACH else NODES_REACH + 0.5 * (grid.width - 2)
         distance = grid.array("obstacles.distance", len(blocks), wp.float64)
         inputs = [c, wp.float64(middle), self._structs[c], self._table, wp.float64(grid.spacing), blocks]
-        grid.launch(kernels.measure_blocks, len(blocks), inputs, [distance])
+        grid.launch(mpm_gaps.measure_blocks, len(blocks), inputs, [distance])
         cells = reach * math.sqrt(3.0) + self._sees + AROUND
         if self.items[c].kind == "plane":
             normal = self._host[c, kernels.ROTATION : kernels.LINEAR].reshape(3, 3)[:, 2]
             beyond = self._sees + self._radius / grid.spacing
             cells = reach * float(np.abs(normal).sum())
-            cells += kernels.OUTSIDE if reach == NODES_REACH else beyond
+            cells += mpm_gaps.OUTSIDE if reach == NODES_REACH else beyond
         if c in self._moving:
             cells += MARGIN
         return np.flatnonzero(distance.numpy() <= cells * grid.spacing)
@@ -302,15 +302,15 @@ class Obstacles:
             self._tile_block, self._around, self._kinds, self._table, self._field, grid.starts,
             grid.coords, grid.particles,
         ]  # fmt: skip
-        grid.launch(kernels.find_gaps, self._tile_count, inputs, [self._seen, self._tiles], minimum=4)
+        grid.launch(mpm_gaps.find_gaps, self._tile_count, inputs, [self._seen, self._tiles], minimum=4)
         inputs = [grid.width, grid.spacing, self._tile, self._seen, self._tiles, self._field]
-        grid.launch(kernels.gather_gaps, len(self._owner), inputs, [self._met, self._gap], minimum=16)
+        grid.launch(mpm_gaps.gather_gaps, len(self._owner), inputs, [self._met, self._gap], minimum=16)
 
     def _measure(self, grid: Grid, c: int) -> None:
         """Signed distance of the nodes near an obstacle."""
         begin, end = self._pairs[c]
         inputs = [c, begin, self._structs[c], self._table, wp.float64(grid.spacing), grid.blocks, self._block]
-        grid.launch(kernels.measure_nodes, 64 * (end - begin), inputs, [self._field])
+        grid.launch(mpm_gaps.measure_nodes, 64 * (end - begin), inputs, [self._field])
 
     def _mix_friction(self, grid: Grid) -> None:
         """Friction of the matter at each node: the mean over its particles, by mass."""

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.errors import SolverError
-from gdpro_sim.simulation.conditions import Motion, pose_at
+from gdpro_sim.simulation.conditions import Guide, Motion, pose_at
 from gdpro_sim.simulation.model import Diagnostics, Model
 from gdpro_sim.simulation.mujoco import soft
 from gdpro_sim.simulation.mujoco.energy import elastic_energy, volume_ratios
@@ -269,7 +269,7 @@ class SolverMuJoCo:
             value = np.interp(time, control.times, control.values)
             self.mjdata.actuator(control.actuator).ctrl = value
 
-    def _driven_bodies(self) -> Iterator[tuple[str, Motion, np.ndarray, np.ndarray]]:
+    def _driven_bodies(self) -> Iterator[tuple[str, Motion | Guide, np.ndarray, np.ndarray]]:
         """(name, motion, rotation [3, 3] and position [3] m at the start) of moved obstacles and pins."""
         for name, collider in zip(self.world.obstacles, self.model.colliders, strict=True):
             if collider.motion is not None:
