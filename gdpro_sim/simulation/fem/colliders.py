@@ -20,9 +20,9 @@ from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import colliders as kernels
 from gdpro_sim.simulation.collider_shapes import ColliderShape, placed
 from gdpro_sim.simulation.colliders import Collider
-from gdpro_sim.simulation.conditions import FOREVER
+from gdpro_sim.simulation.conditions import FOREVER, Guide
 from gdpro_sim.simulation.fem.rest import RestShapes, reals
-from gdpro_sim.simulation.fem.term import Step
+from gdpro_sim.simulation.fem.term import Step, hosted
 from gdpro_sim.simulation.model import Model
 
 CONTACT_PER_ELASTIC = 3.0
@@ -95,9 +95,20 @@ class ColliderContact:
             wp.zeros(self.energies, dtype=wp.float64, device=self.device) for _ in range(4)
         )
         self._start: wp.array | None = None
+        # Of one that is guided: forces on the vertices, and what they gave it in the step under way.
+        self._forces, self._blocks = (
+            wp.zeros(self.energies if self.guided else 0, dtype=dtype, device=self.device)
+            for dtype in (wp.vec3d, wp.mat33d)
+        )
+        self.impulse = np.zeros(6)
         x: wp.array = wp.array(model.vertices.astype(np.float64), dtype=wp.vec3d, device=self.device)
         self._over_vertices(kernels.place_anchors, [self.body.now, x], [self._anchor])
         self._check_outside(model, x)
+
+    @property
+    def guided(self) -> bool:
+        """Whether another solver moves it, and wants to know what it is given."""
+        return isinstance(self.body.collider.motion, Guide)
 
     def begin(self, step: Step) -> None:
         self._start = step.x
@@ -133,6 +144,16 @@ class ColliderContact:
     def finish(self, x: wp.array) -> None:
         """Drag the friction anchors along."""
         self._over_vertices(kernels.drag_anchors, [self.body.now, self.touch, x], [self._anchor])
+
+    def take_impulse(self, x: wp.array, duration: float) -> None:
+        """Add what the vertices at x, whose forces act for `duration` s, give a guided collider."""
+        self._forces.zero_()
+        self._blocks.zero_()
+        self.add_derivatives(x, self._forces, self._blocks)
+        forces = hosted(self._forces)  # of the collider on its surroundings: the gradient's sign
+        acting = np.flatnonzero(forces.any(axis=1))
+        given, points = forces[acting], hosted(x)[acting]
+        self.impulse = self.impulse + duration * np.append(given.sum(0), np.cross(points, given).sum(0))
 
     def stored(self, x: wp.array) -> float:
         self.lag(x)

@@ -97,9 +97,12 @@ class SolverFEM:
     def __init__(self, model: Model) -> None:
         self.model = model
         rest = rest_shapes(model)
+        contacts = collider_contacts(model, rest)
+        self._obstacles = contacts[len(contacts) - len(model.colliders) :]
+        self._guided = [obstacle for obstacle in self._obstacles if obstacle.guided]
         self.terms: tuple[Term, ...] = (
             *force_terms(model, rest),
-            *collider_contacts(model, rest),
+            *contacts,
             *body_contact(model, rest),
         )
         self._potential = IncrementalPotential(model, rest, self.terms)
@@ -150,6 +153,7 @@ class SolverFEM:
         self._assign(self._initial)
         self._time = 0.0
         self._counters = _Counters()
+        self._stand()
 
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds in `FemSettings.substeps` implicit steps, halving those that fail.
@@ -163,14 +167,18 @@ class SolverFEM:
             raise SolverError(f"step length must be a finite number > 0 s, got {dt}")
         for name, array in self._changing.items():
             wp.copy(self._saved[name], array)
-        before, time = self._counters, self._time
+        before, time, impulses = self._counters, self._time, [item.impulse for item in self._guided]
         self._counters = _Counters()
+        for item in self._guided:
+            item.impulse = np.zeros(6)
         try:
             self._advance_all(dt)
         except BaseException:  # Ctrl-C too: half a step is no state to continue from
             for name, array in self._changing.items():
                 wp.copy(array, self._saved[name])
             self._counters, self._time = before, time
+            for item, impulse in zip(self._guided, impulses, strict=True):
+                item.impulse = impulse
             raise
         self._time = time + dt
         if not self._counters.converged:
@@ -205,6 +213,8 @@ class SolverFEM:
                 f"no finite solution for a substep of {dt:.3g} s at t = {self._time:.6g} s: raise the "
                 "substeps, or check velocities and material constants"
             )
+        if rule != "midpoint":  # which touches nothing
+            self._take_impulses(self._potential.trial, dt)
         if (rule == "midpoint" and self._touching(self._potential.trial)) or not step.finish():
             logger.debug("midpoint step of %.3g s meets something: backward Euler instead", dt)
             self._advance(dt, "backward-euler", splits)
@@ -214,6 +224,10 @@ class SolverFEM:
         counters.substeps += 1
         counters.converged &= outcome.converged
         counters.residual = max(counters.residual, outcome.residual)
+
+    def _take_impulses(self, x: wp.array, dt: float) -> None:
+        for item in self._guided:
+            item.take_impulse(x, dt)
 
     def _touching(self, x: wp.array) -> bool:
         return any(term.report(x).get("contacts", 0.0) > 0.0 for term in self.terms)
@@ -266,6 +280,7 @@ class SolverFEM:
             p.strain_base(state.x_before if known else state.x, 1.0, state.x, 0.0)
             p.lag(state.x)
             p.forces(state.x)
+            self._take_impulses(state.x, h)
             wp.copy(state.x_before, state.x)
             p.over_vertices(
                 fem.kick, [p.vertices, p.element_gradient, p.gradient, self._gravity, h], [state.v]
@@ -420,6 +435,16 @@ class SolverFEM:
         potential.move_trial(1.0 / longer)
         return potential.energy(potential.trial)
 
+    def collider_impulses(self) -> np.ndarray:
+        """[C, 6] N s and N m s about the world's origin that bodies gave each of `Model.colliders`.
+
+        In the last step, summed over its substeps; 0 before any, in a quasi-static step, which has no
+        duration, and for those that are not guided (whose motion is no
+        `gdpro_sim.simulation.conditions.Guide`). With BDF2 it is the change of 3/2 p_n - 1/2 p_(n-1), whose
+        sum over steps is that of momentum.
+        """
+        return np.array([item.impulse for item in self._obstacles]).reshape(-1, 6)
+
     def surface_positions(self, body: int) -> np.ndarray:
         """Deformed surface vertices of body number `body`, [V, 3] float32 m, world.
 
@@ -459,6 +484,13 @@ class SolverFEM:
         self._time = float(state["time"])
         substeps, newton, cg, converged, residual = state["counters"].tolist()
         self._counters = _Counters(int(substeps), int(newton), int(cg), bool(converged), residual)
+        self._stand()
+
+    def _stand(self) -> None:
+        """Put colliders where they are now, given nothing yet."""
+        for item in self._obstacles:
+            item.body.place(self._time, self._time)
+            item.impulse = np.zeros(6)
 
     def diagnostics(self) -> Diagnostics:
         """Figures of the last step (of the initial state before any)."""
