@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from gdpro_sim.errors import SceneError
 from gdpro_sim.meshing.embedding import boundary, embed_surface
 from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.tetmesh import TetMesh
+from gdpro_sim.simulation.callbacks import Callback
 from gdpro_sim.simulation.conditions import FOREVER, Force, Impulse, Load, Motion, Pressure, Springs, Wind
 from gdpro_sim.simulation.forces import Attachment, Pin, Spring, SpringEnd
 from gdpro_sim.simulation.model import Body, Model
@@ -34,7 +35,7 @@ def apply_conditions(scene: Scene, model: Model) -> Model:
 
     Raises SceneError for what selects nothing or contradicts itself.
     """
-    placed = [_Tets(scene, body, model) for body in model.bodies]
+    placed = [Tets(scene, body, model) for body in model.bodies]
     by_name = {body.name: body for body in placed}
     pinned = np.zeros(len(model.vertices), bool)
     release = np.full(len(model.vertices), FOREVER)
@@ -44,20 +45,26 @@ def apply_conditions(scene: Scene, model: Model) -> Model:
         motions += _pins(body, item, pinned, release)
         if body.forces or body.impulses:
             loads += compile_pushes(body, item, _masses(item, model))
-        loads += _pressures(body, item)
-    for air in scene.wind:
-        names = air.bodies or [body.name for body in scene.bodies]
-        faces = np.concatenate([by_name[name].faces + by_name[name].first for name in dict.fromkeys(names)])
-        end = FOREVER if air.end is None else air.end
-        loads.append(Wind(faces, air.velocity, air.density, air.drag, air.lift, air.start, end))
-    springs = [_spring(scene, k, spring, by_name) for k, spring in enumerate(scene.springs)]
-    springs += [_ties(scene, k, ties, by_name, model) for k, ties in enumerate(scene.attachments)]
+        loads += compile_pressures(body, item)
+    loads += compile_winds(scene, by_name)
+    springs = [compile_spring(scene, k, spring, by_name) for k, spring in enumerate(scene.springs)]
+    for k, ties in enumerate(scene.attachments):
+        a, b = (by_name[name] for name in ties.bodies)
+        ids = tied(scene, k, ties, a, b)
+        if ties.stiffness is None:
+            # Imported here: it brings the solver's kernels, which most scenes need not wait for yet.
+            from gdpro_sim.simulation.fem.rest import rest_shapes
+
+            stiffness = TIE_PER_ELASTIC * rest_shapes(model).stiffness[a.first + ids]
+        else:
+            stiffness = np.full(len(ids), ties.stiffness / len(ids))
+        springs.append(compile_ties(ties, a, b, ids, stiffness))
     return replace(
         model,
         pinned=pinned,
         release=release if np.isfinite(release).any() else None,
         motions=tuple(motions),
-        springs=_joined(springs) if springs else None,
+        springs=joined(springs) if springs else None,
         loads=tuple(loads),
     )
 
@@ -103,11 +110,18 @@ class Placed:
         return f"the body spans {low} to {high} m"
 
 
-class _Tets(Placed):
-    """A body of tets.
+class Faced(Placed):
+    """A body with a surface: faces [f, 3], outward, from its own first point."""
 
-    tets: [t, 4] and faces [f, 3], outward: from its own first vertex
-    """
+    faces: np.ndarray
+
+    def carried(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Corners [n, 4] int32 of the model and weights [n, 4] that carry points [n, 3] m along."""
+        raise NotImplementedError
+
+
+class Tets(Faced):
+    """A body of tets [t, 4], from its own first vertex."""
 
     def __init__(self, scene: Scene, body: Body, model: Model) -> None:
         first, end = body.vertex_range
@@ -115,9 +129,12 @@ class _Tets(Placed):
         self.tets = model.tets[slice(*body.tet_range)] - np.int32(first)
         self.faces, _ = boundary(self.tets)
 
-    def tetmesh(self) -> TetMesh:
+    def carried(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Those of elements."""
         fill = np.ones(len(self.tets), np.float32)
-        return TetMesh(self.points.astype(np.float32), self.tets.astype(np.int32), fill, "tetwild")
+        mesh = TetMesh(self.points.astype(np.float32), self.tets.astype(np.int32), fill, "tetwild")
+        found = embed_surface(mesh, points)
+        return (self.tets[found.tet_ids] + self.first).astype(np.int32), found.weights.astype(np.float64)
 
 
 def chosen_pins(body: SceneBody, item: Placed) -> list[np.ndarray]:
@@ -137,7 +154,7 @@ def chosen_pins(body: SceneBody, item: Placed) -> list[np.ndarray]:
     return chosen
 
 
-def _pins(body: SceneBody, item: _Tets, pinned: np.ndarray, release: np.ndarray) -> Iterator[Motion]:
+def _pins(body: SceneBody, item: Tets, pinned: np.ndarray, release: np.ndarray) -> Iterator[Motion]:
     """Marks pinned vertices and their release times; yields what moves."""
     owned = np.zeros(len(item.points), bool)
     for k, (pin, held) in enumerate(zip(body.pins, chosen_pins(body, item), strict=True)):
@@ -155,7 +172,8 @@ def _pins(body: SceneBody, item: _Tets, pinned: np.ndarray, release: np.ndarray)
 def _agree(a: Pin, a_ids: np.ndarray, b: Pin, b_ids: np.ndarray) -> bool:
     if (a.motion, a.pivot, a.start, a.release) != (b.motion, b.pivot, b.start, b.release):
         return False
-    turns = a.pivot is None and any(any(key.rotation) for key in a.motion)
+    scripted = isinstance(a.motion, Callback)
+    turns = a.pivot is None and (scripted or any(any(key.rotation) for key in a.motion))
     return not turns or np.array_equal(a_ids, b_ids)
 
 
@@ -175,7 +193,7 @@ def compile_pushes(body: SceneBody, item: Placed, mass: np.ndarray) -> Iterator[
         yield Impulse((item.first + ids).astype(np.int32), each, push.time)
 
 
-def _pressures(body: SceneBody, item: _Tets) -> Iterator[Load]:
+def compile_pressures(body: SceneBody, item: Faced) -> Iterator[Load]:
     for k, load in enumerate(body.pressures):
         inside = np.zeros(len(item.points), bool)
         inside[item.select(load, f"pressures[{k}]")] = True
@@ -190,7 +208,7 @@ def _pressures(body: SceneBody, item: _Tets) -> Iterator[Load]:
         yield Pressure(faces + item.first, load.pressure, closed, load.start, end)
 
 
-def _masses(item: _Tets, model: Model) -> np.ndarray:
+def _masses(item: Tets, model: Model) -> np.ndarray:
     """[n] kg of the body's vertices, a quarter of each element's."""
     (ids,) = [body.tet_range for body in model.bodies if body.name == item.name]
     corners = item.points[item.tets]
@@ -199,7 +217,17 @@ def _masses(item: _Tets, model: Model) -> np.ndarray:
     return np.bincount(item.tets.reshape(-1), weights=np.repeat(mass / 4.0, 4), minlength=len(item.points))
 
 
-def _spring(scene: Scene, k: int, spring: Spring, bodies: dict[str, _Tets]) -> Springs:
+def compile_winds(scene: Scene, bodies: Mapping[str, Faced]) -> Iterator[Load]:
+    """Air on the surfaces of bodies."""
+    for air in scene.wind:
+        chosen = [bodies[name] for name in dict.fromkeys(air.bodies or bodies)]
+        faces = np.concatenate([body.faces + body.first for body in chosen])
+        end = FOREVER if air.end is None else air.end
+        yield Wind(faces, air.velocity, air.density, air.drag, air.lift, air.start, end)
+
+
+def compile_spring(scene: Scene, k: int, spring: Spring, bodies: Mapping[str, Faced]) -> Springs:
+    """One spring. Raises SceneError for an end away from its body."""
     ends = [_end(f"{scene.name}: springs[{k}].ends[{e}]", end, bodies) for e, end in enumerate(spring.ends)]
     length = spring.rest_length
     if length is None:
@@ -210,7 +238,7 @@ def _spring(scene: Scene, k: int, spring: Spring, bodies: dict[str, _Tets]) -> S
 
 
 def _end(
-    where: str, end: SpringEnd, bodies: dict[str, _Tets]
+    where: str, end: SpringEnd, bodies: Mapping[str, Faced]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Corners [4], weights [4], anchor [3] m, and where it is at the start [3] m."""
     if end.body is None:
@@ -228,18 +256,12 @@ def _end(
     away = float(distance_outside(point[None], body.points, body.faces)[0])
     if away > END_OUTSIDE * body.size:
         raise SceneError(f"{where}.point: lies {away:.3g} m outside {end.body!r}; {body.span()}")
-    corners, weights = _carried(body, point[None])
+    corners, weights = body.carried(point[None])
     return corners[0], weights[0], np.zeros(3), point
 
 
-def _carried(body: _Tets, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners [n, 4] and weights [n, 4] of the elements that carry points [n, 3] m along."""
-    found = embed_surface(body.tetmesh(), points)
-    return (body.tets[found.tet_ids] + body.first).astype(np.int32), found.weights.astype(np.float64)
-
-
-def _ties(scene: Scene, k: int, ties: Attachment, bodies: dict[str, _Tets], model: Model) -> Springs:
-    a, b = (bodies[name] for name in ties.bodies)
+def tied(scene: Scene, k: int, ties: Attachment, a: Faced, b: Faced) -> np.ndarray:
+    """Points on the surface of `a`, from its first, that are tied to `b`. Raises SceneError for none."""
     where = f"{scene.name}: attachments[{k}]"
     ids = np.unique(a.faces)
     if ties.chosen:
@@ -252,19 +274,16 @@ def _ties(scene: Scene, k: int, ties: Attachment, bodies: dict[str, _Tets], mode
             f"{where}: no chosen vertex on the surface of {a.name!r} lies within {reach:.3g} m of {b.name!r}"
             f"{nearest}; move the bodies together, or raise `distance`"
         )
-    ids = ids[away <= reach]
-    count = len(ids)
-    if ties.stiffness is None:
-        # Imported here: it brings the solver's kernels, which most scenes need not wait for yet.
-        from gdpro_sim.simulation.fem.rest import rest_shapes
+    return ids[away <= reach]
 
-        stiffness = TIE_PER_ELASTIC * rest_shapes(model).stiffness[a.first + ids]
-    else:
-        stiffness = np.full(count, ties.stiffness / count)
+
+def compile_ties(ties: Attachment, a: Faced, b: Faced, ids: np.ndarray, stiffness: np.ndarray) -> Springs:
+    """Springs without length of `stiffness` [n] N/m from points of `a` to where `b` carries them."""
+    count = len(ids)
     corners, weights = np.zeros((count, 2, 4), np.int32), np.zeros((count, 2, 4))
     corners[:, 0] = (a.first + ids)[:, None]
     weights[:, 0, 0] = 1.0
-    corners[:, 1], weights[:, 1] = _carried(b, a.points[ids])
+    corners[:, 1], weights[:, 1] = b.carried(a.points[ids])
     return Springs(
         corners,
         weights,
@@ -275,7 +294,8 @@ def _ties(scene: Scene, k: int, ties: Attachment, bodies: dict[str, _Tets], mode
     )
 
 
-def _joined(parts: list[Springs]) -> Springs:
+def joined(parts: list[Springs]) -> Springs:
+    """Several as one, in their order."""
     return Springs(
         *(
             np.concatenate([getattr(part, key) for part in parts])
@@ -292,4 +312,17 @@ def distance_outside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
     return np.where(index.inside(points), 0.0, np.linalg.norm(points - nearest, axis=1))
 
 
-__all__ = ["Placed", "apply_conditions", "chosen_pins", "compile_pushes", "distance_outside"]
+__all__ = [
+    "Faced",
+    "Placed",
+    "apply_conditions",
+    "chosen_pins",
+    "compile_pressures",
+    "compile_pushes",
+    "compile_spring",
+    "compile_ties",
+    "compile_winds",
+    "distance_outside",
+    "joined",
+    "tied",
+]
