@@ -37,6 +37,8 @@ class Asset:
     embedding:     where the mesh's vertices sit in `tets`; present exactly when `tets` is
     material:      proposed by whoever made the asset, overridable in a scene
     pieces:        convex pieces for rigid contact, or None where nobody has needed them yet
+    groups:        named sets of the mesh's vertices: ascending int32 ids, at least one
+    group_materials: of groups that are made of something else than `material`
     provenance:    JSON values: source file, SHA-256, versions, seed, command
 
     Raises AssetError where the parts do not fit together.
@@ -50,6 +52,8 @@ class Asset:
     material: Material | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     pieces: ConvexPieces | None = None
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
+    group_materials: dict[str, Material] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_binding(self.name, self.gaussians)
@@ -63,6 +67,7 @@ class Asset:
             _check_embedding(self.name, self.embedding, vertex_count, len(self.tets.tets))
         if self.pieces is not None:
             _check_pieces(self.name, self.pieces)
+        _check_groups(self.name, self.groups, self.group_materials, vertex_count)
         try:
             normal = json.loads(json.dumps(self.provenance, allow_nan=False))
         except (TypeError, ValueError) as error:
@@ -91,7 +96,7 @@ class Asset:
         usd_stage, root = stage.open_root(layer, path, "asset")
         with stage.reading(path):
             asset = _read(usd_stage, root)
-            if root.GetAttribute("gdpro:digest").Get() != _digest(asset):
+            if root.GetAttribute("gdpro:digest").Get() != asset.digest:
                 log.warning("%s differs from what was saved: it was edited, or it is damaged", path)
             return asset
 
@@ -106,6 +111,15 @@ class Asset:
             tets = replace(tets, vertices=tets.vertices * np.float32(factor))
         pieces = None if self.pieces is None else self.pieces.scaled(factor)
         return replace(self, gaussians=self.gaussians.scaled(factor), tets=tets, pieces=pieces)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything the asset holds, so that a damaged file is noticed and parts are known again.
+
+        Of materials what differs from defaults, and of groups only where there are some, so that files from
+        before a field came still fit.
+        """
+        return _digest(self)
 
     def summary(self) -> dict[str, Any]:
         """What the asset holds, as JSON values: counts, size in m, volume in m^3, mass in kg, material."""
@@ -135,6 +149,10 @@ class Asset:
             result["convex_pieces"] = len(self.pieces)
         if self.material is not None:
             result["material"] = self.material.model_dump()
+        if self.groups:
+            result["groups"] = {name: len(ids) for name, ids in self.groups.items()}
+        if self.group_materials:
+            result["group_materials"] = {k: m.model_dump() for k, m in self.group_materials.items()}
         result["provenance"] = self.provenance
         return result
 
@@ -218,14 +236,23 @@ def _check_pieces(asset: str, pieces: ConvexPieces) -> None:
         _check_indices(asset, f"pieces[{k}].faces", faces, len(vertices), "vertices")
 
 
+def _check_groups(
+    asset: str, groups: dict[str, np.ndarray], materials: dict[str, Material], vertex_count: int
+) -> None:
+    for name, ids in groups.items():
+        _check_array(asset, f"groups[{name!r}]", ids, np.int32, (len(ids),))
+        if not name or not len(ids) or (np.diff(ids) <= 0).any():
+            raise AssetError(f"asset {asset!r}: group {name!r} must have a name and ascending vertex ids")
+        _check_indices(asset, f"groups[{name!r}]", ids, vertex_count, "vertices")
+    for name in materials:
+        if name not in groups:
+            raise AssetError(f"asset {asset!r}: group_materials names {name!r}, which is no group")
+
+
 # ---- file ----
 
 
 def _digest(asset: Asset) -> str:
-    """SHA-256 of everything an asset holds, so that a damaged file is noticed.
-
-    Of the material what differs from defaults, so that files from before a field came still fit.
-    """
     material = "" if asset.material is None else asset.material.model_dump_json(exclude_defaults=True)
     method = asset.tets.method if asset.tets is not None else ""
     result = hashlib.sha256(json.dumps([asset.name, asset.provenance, material, method]).encode())
@@ -237,6 +264,11 @@ def _digest(asset: Asset) -> str:
         arrays += [asset.embedding.tet_ids, asset.embedding.weights]
     if asset.pieces is not None:
         arrays += [asset.pieces.vertices, asset.pieces.faces, asset.pieces.counts]
+    for name, ids in asset.groups.items():
+        other = asset.group_materials.get(name)
+        text = "" if other is None else other.model_dump_json(exclude_defaults=True)
+        result.update(json.dumps([name, text]).encode())
+        arrays.append(ids)
     for array in arrays:
         result.update(np.ascontiguousarray(array).data)
     return result.hexdigest()
@@ -247,7 +279,7 @@ def _author(layer: Sdf.Layer, asset: Asset) -> None:
     root = usd_stage.GetDefaultPrim()
     stage.set_custom(root, "gdpro:name", prims.T.String, asset.name)
     stage.set_custom(root, "gdpro:provenance", prims.T.String, json.dumps(asset.provenance))
-    stage.set_custom(root, "gdpro:digest", prims.T.String, _digest(asset))
+    stage.set_custom(root, "gdpro:digest", prims.T.String, asset.digest)
     parent = root.GetPath()
     bound = asset.gaussians
     rest = bound.gaussians()
@@ -273,6 +305,8 @@ def _author(layer: Sdf.Layer, asset: Asset) -> None:
         prims.define_pieces(usd_stage, parent, asset.pieces)
     if asset.material is not None:
         prims.define_material(usd_stage, parent, asset.material, tets)
+    if asset.groups:
+        prims.define_groups(usd_stage, mesh, asset.groups, asset.group_materials)
 
 
 def _read(usd_stage: Usd.Stage, root: Usd.Prim) -> Asset:
@@ -302,6 +336,7 @@ def _read(usd_stage: Usd.Stage, root: Usd.Prim) -> Asset:
     except ValueError as error:
         raise AssetError(f"gdpro:provenance is not JSON: {error}") from error
     name = root.GetAttribute("gdpro:name").Get()
+    groups, materials = prims.read_groups(mesh)
     return Asset(
         name=str(name if name is not None else ""),
         gaussians=bound,
@@ -311,6 +346,8 @@ def _read(usd_stage: Usd.Stage, root: Usd.Prim) -> Asset:
         material=prims.read_material(material_prim) if material_prim else None,
         provenance=provenance,
         pieces=prims.read_pieces(pieces_prim) if pieces_prim else None,
+        groups=groups,
+        group_materials=materials,
     )
 
 

@@ -377,6 +377,39 @@ def read_pieces(prim: Usd.Prim) -> ConvexPieces:
     return ConvexPieces(vertices, faces.reshape(-1, 3), counts.reshape(-1, 2), float(concavity))
 
 
+# ---- vertex groups ----
+
+_FAMILY = "gdproGroups"
+
+
+def define_groups(
+    stage: Usd.Stage, mesh: Usd.Prim, groups: dict[str, np.ndarray], materials: dict[str, Material]
+) -> None:
+    """Named sets of a mesh's vertices as point subsets, in order, with what they are made of."""
+    for number, (name, ids) in enumerate(groups.items()):
+        subset = UsdGeom.Subset.Define(stage, mesh.GetPath().AppendChild(f"Group{number}"))
+        subset.CreateElementTypeAttr(UsdGeom.Tokens.point)
+        subset.CreateFamilyNameAttr(_FAMILY)
+        subset.CreateIndicesAttr(ints(ids))
+        prim = subset.GetPrim()
+        set_custom(prim, "gdpro:name", T.String, name)
+        if name in materials:
+            set_custom(prim, "gdpro:material", T.String, materials[name].model_dump_json())
+
+
+def read_groups(mesh: Usd.Prim) -> tuple[dict[str, np.ndarray], dict[str, Material]]:
+    """Vertex groups as written, and the materials of those that have one. Raises AssetError."""
+    groups, materials = {}, {}
+    for prim in mesh.GetChildren():
+        subset = UsdGeom.Subset(prim)
+        if subset and subset.GetFamilyNameAttr().Get() == _FAMILY:
+            name = str(prim.GetAttribute("gdpro:name").Get())
+            groups[name] = read(prim, "indices", np.int32, (-1,))
+            if prim.GetAttribute("gdpro:material"):
+                materials[name] = read_material(prim)
+    return groups, materials
+
+
 # ---- reading ----
 
 
@@ -416,6 +449,7 @@ __all__ = [
     "T",
     "Time",
     "bounds",
+    "define_groups",
     "define_material",
     "define_mesh",
     "define_pieces",
@@ -424,6 +458,7 @@ __all__ = [
     "ints",
     "read",
     "read_binding",
+    "read_groups",
     "read_material",
     "read_pieces",
     "read_splats",

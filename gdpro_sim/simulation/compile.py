@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,19 @@ from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.colliders import MeshCollider, compile_collider
+from gdpro_sim.simulation.compile_coupled import as_part, compile_coupled, part_of
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
 from gdpro_sim.simulation.compile_mpm import compile_particles
 from gdpro_sim.simulation.compile_mujoco import compile_mujoco, prepare
+from gdpro_sim.simulation.group_materials import materials_at
 from gdpro_sim.simulation.model import Body, Ground, Model
 from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.placement import material_of, place
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.scene_body import SceneBody
-from gdpro_sim.simulation.solver_options import MpmOptions
+from gdpro_sim.simulation.solver_options import CoupledOptions, MpmOptions
+
+log = logging.getLogger(__name__)
 
 
 def check_files(scene: Scene) -> None:
@@ -38,10 +44,11 @@ def check_files(scene: Scene) -> None:
             if reference is not None and not scene.resolve(reference).exists():
                 path = scene.resolve(reference)
                 raise SceneError(f"{scene.name}: bodies[{body.name}].{key}: {path}: no such file")
-    if isinstance(scene.solver, MujocoOptions) and scene.solver.base is not None:
-        if not scene.resolve(scene.solver.base).is_file():
-            path = scene.resolve(scene.solver.base)
-            raise SceneError(f"{scene.name}: solver.base: {path}: no such file")
+    rigid = scene.mujoco_options
+    if rigid is not None and rigid.base is not None and not scene.resolve(rigid.base).is_file():
+        path = scene.resolve(rigid.base)
+        key = "solver.base" if rigid is scene.solver else "solver.mujoco.base"
+        raise SceneError(f"{scene.name}: {key}: {path}: no such file")
     for k, collider in enumerate(scene.colliders):
         if isinstance(collider, MeshCollider) and not scene.resolve(collider.file).exists():
             path = scene.resolve(collider.file)
@@ -61,7 +68,6 @@ def load_assets(
     """
     check_files(scene)
     tell = on_progress or (lambda phase: None)
-    fem = not isinstance(scene.solver, MpmOptions | MujocoOptions)
     assets: dict[str, Asset] = {}
     for body in scene.bodies:
         if stored and body.name in stored:
@@ -85,24 +91,27 @@ def load_assets(
                 color=body.color,
                 texture=None if body.texture is None else scene.resolve(body.texture),
                 up=body.up,
-                tets=fem,
+                tets=part_of(scene, body) == "fem",
                 target_tets=body.tets,
                 seed=scene.seed,
                 on_progress=tell,
             )
-        if asset.gaussians.is_loose and not isinstance(scene.solver, MpmOptions):
+        part = part_of(scene, body, asset)
+        if asset.gaussians.is_loose and part != "mpm":
             raise SceneError(
                 f"{scene.name}: body {body.name!r}: {path.name} is a splat cloud without a mesh, which only "
                 "MPM can simulate (`solver: {kind: mpm}`); `gdpro generate --from-splat` makes an asset with "
                 "a mesh"
             )
-        if isinstance(scene.solver, MujocoOptions):
-            asset = prepare(body, asset, tell)
-        if asset.tets is None and fem:
+        if part == "mujoco":
+            asset = prepare(as_part(scene, body), asset, tell)
+        if asset.tets is None and part == "fem":
             # At the asset's own size: the caller may place several bodies of one asset at several sizes.
             asset = tetrahedralize_asset(asset, target_tets=body.tets, on_progress=tell)
         if asset.material is None or body.material is not None:
             asset = replace(asset, material=material_of(body, asset))
+        if body.material is not None:
+            asset = replace(asset, group_materials={})
         assets[body.name] = asset
     return assets
 
@@ -117,7 +126,10 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
     if isinstance(options, MpmOptions):
         return compile_particles(scene, options, assets, device=device)
     if isinstance(options, MujocoOptions):
+        _tell_one_material(assets)
         return compile_mujoco(scene, options, assets, device=device)
+    if isinstance(options, CoupledOptions):
+        return compile_coupled(scene, options, assets, partial(compile_scene, device=device))
     bodies: list[Body] = []
     columns: dict[str, list[np.ndarray]] = {
         key: []
@@ -134,24 +146,26 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         if asset.tets is None or asset.embedding is None:
             raise SceneError(f"{where}: its asset has no tetrahedra")
         _check_vertices(where, asset.tets)
-        material = _of_elements(where, body, asset)
         placement = place(scene, body, asset)
         asset = placement.asset
         assert asset.tets is not None and asset.embedding is not None
+        made, matter = materials_at(body, asset, asset.tets.vertices[asset.tets.tets].mean(axis=1))
+        _check_elements(where, body, made)
         vertices = placement(asset.tets.vertices)
-        centre = _centre_of_mass(asset.tets, vertices)
+        centre = _centre_of_mass(asset.tets, vertices, np.array([m.density for m in made])[matter])
 
-        count, elements = len(vertices), len(asset.tets.tets)
+        count = len(vertices)
         columns["vertices"].append(vertices.astype(np.float32))
         columns["velocities"].append(placement.velocities(body, vertices, centre))
         columns["tets"].append(asset.tets.tets + np.int32(vertex_begin))
         columns["fill"].append(asset.tets.fill)
         for key in ("young", "poisson", "density", "rayleigh_mass", "rayleigh_stiffness", "hardening"):
-            columns[key].append(np.full(elements, getattr(material, key), np.float32))
-        yields = np.inf if material.yield_stress is None else material.yield_stress
-        columns["yield_stress"].append(np.full(elements, yields, np.float32))
-        columns["law"].append(np.full(elements, material.law, np.int32))
-        columns["friction"].append(np.full(count, material.friction, np.float32))
+            columns[key].append(np.array([getattr(m, key) for m in made], np.float32)[matter])
+        yields = [np.inf if m.yield_stress is None else m.yield_stress for m in made]
+        columns["yield_stress"].append(np.array(yields, np.float32)[matter])
+        columns["law"].append(np.array([m.law for m in made], np.int32)[matter])
+        _, touching = materials_at(body, asset, asset.tets.vertices)
+        columns["friction"].append(np.array([m.friction for m in made], np.float32)[touching])
         rest = asset.gaussians.vertices.cpu().numpy().astype(np.float64)
         columns["contact_offset"].append(
             distance_outside(asset.tets.vertices, rest, asset.gaussians.faces.cpu().numpy()).astype(
@@ -165,11 +179,11 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
                 surface=placement.surface,
                 embedding=asset.embedding,
                 vertex_range=(vertex_begin, vertex_begin + count),
-                tet_range=(tet_begin, tet_begin + elements),
+                tet_range=(tet_begin, tet_begin + len(asset.tets.tets)),
             )
         )
         vertex_begin += count
-        tet_begin += elements
+        tet_begin += len(asset.tets.tets)
     arrays: dict[str, Any] = {key: np.concatenate(parts) for key, parts in columns.items()}
     model = Model(
         bodies=tuple(bodies),
@@ -184,16 +198,24 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
     return apply_conditions(scene, model)
 
 
-def _of_elements(where: str, body: SceneBody, asset: Asset) -> Material:
-    """The body's material. Raises SceneError for what only MPM can simulate."""
-    material = material_of(body, asset)
-    reason = material.mpm_only()
-    if reason is not None:
-        raise SceneError(f"{where}: {reason}")
+def _tell_one_material(assets: dict[str, Asset]) -> None:
+    for name, asset in assets.items():
+        if asset.group_materials and asset.material is not None:
+            log.warning(
+                "body %r: MuJoCo's bodies are of one material: the density and stiffness of its main one "
+                "stand for those of %s", name, ", ".join(map(repr, asset.group_materials)),
+            )  # fmt: skip
+
+
+def _check_elements(where: str, body: SceneBody, made: tuple[Material, ...]) -> None:
+    """Raise SceneError for what only MPM can simulate."""
+    for material in made:
+        reason = material.mpm_only()
+        if reason is not None:
+            raise SceneError(f"{where}: {reason}")
     for key in ("particles", "parts"):
         if getattr(body, key):
             raise SceneError(f"{where}: `{key}` belongs to MPM (`solver: {{kind: mpm}}`)")
-    return material
 
 
 def _check_vertices(where: str, mesh: TetMesh) -> None:
@@ -207,9 +229,9 @@ def _check_vertices(where: str, mesh: TetMesh) -> None:
         )
 
 
-def _centre_of_mass(tets: TetMesh, vertices: np.ndarray) -> np.ndarray:
-    """Centre of mass [3] of placed tet `vertices` [P, 3] of one density."""
-    mass = tets.volumes() * tets.fill
+def _centre_of_mass(tets: TetMesh, vertices: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Centre of mass [3] of placed tet `vertices` [P, 3]; density [T] kg/m^3."""
+    mass = tets.volumes() * tets.fill * density
     return (mass[:, None] * vertices[tets.tets].mean(axis=1)).sum(axis=0) / mass.sum()
 
 

@@ -19,9 +19,10 @@ from gdpro_sim.simulation.colliders import compile_collider
 from gdpro_sim.simulation.compile_forces import Placed, chosen_pins, compile_pushes
 from gdpro_sim.simulation.conditions import FOREVER, Hold, Load
 from gdpro_sim.simulation.forces import Pin
+from gdpro_sim.simulation.group_materials import materials_at
 from gdpro_sim.simulation.model import Body, Ground, Model, MpmSettings, Particles
 from gdpro_sim.simulation.mpm.matter import flows
-from gdpro_sim.simulation.placement import Placement, material_of, place
+from gdpro_sim.simulation.placement import Placement, place
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.solver_options import MpmOptions
 
@@ -49,7 +50,6 @@ def compile_particles(
     """
     _check_supported(scene)
     placements = [place(scene, body, assets[body.name]) for body in scene.bodies]
-    made = [material_of(body, assets[body.name]) for body in scene.bodies]
     spacings, grid_spacing = _resolution(scene, options, placements)
     materials: dict[Material, int] = {}
     bodies: list[Body] = []
@@ -57,23 +57,24 @@ def compile_particles(
         key: [] for key in ("positions", "velocities", "volumes", "matter", "gradients")
     }
     begin = 0
-    for body, placement, material, spacing in zip(scene.bodies, placements, made, spacings, strict=True):
+    for body, placement, spacing in zip(scene.bodies, placements, spacings, strict=True):
         where = f"{scene.name}: body {body.name!r}"
         filling = _filled(where, placement.asset, spacing, options.fill, scene.seed)
         points = placement(filling.points)
         volumes = filling.volumes.astype(np.float64)
         count = len(filling)
-        parts = [part.material for part in body.parts]
-        if options.integrator == "implicit" and any(flows(item) for item in (material, *parts)):
+        own, within = materials_at(body, placement.asset, filling.points)
+        made = (*own, *(part.material for part in body.parts))
+        if options.integrator == "implicit" and any(flows(item) for item in made):
             raise SceneError(
                 f"{where}: its material flows, yields or tears, which the implicit integrator cannot do; use "
                 "`integrator: explicit`"
             )
-        numbers = [materials.setdefault(item, len(materials)) for item in (material, *parts)]
-        matter = np.full(count, numbers[0], np.int32)
+        numbers = np.array([materials.setdefault(item, len(materials)) for item in made], np.int32)
+        matter = numbers[within]
         chosen = Placed(scene, body.name, points, begin, "particle")
         for k, part in enumerate(body.parts):
-            matter[chosen.select(part, f"parts[{k}]")] = numbers[1 + k]
+            matter[chosen.select(part, f"parts[{k}]")] = numbers[len(own) + k]
         density = np.array([item.density for item in materials])[matter]
         mass = volumes * density
         centre = (mass[:, None] * points).sum(axis=0) / mass.sum()
@@ -83,7 +84,7 @@ def compile_particles(
         columns["gradients"].append(np.broadcast_to(spin, (count, 3, 3)))
         columns["volumes"].append(filling.volumes)
         columns["matter"].append(matter)
-        loose = any(item.mpm_only() is not None for item in (material, *parts))
+        loose = any(item.mpm_only() is not None for item in made)
         bodies.append(
             replace(
                 _surface(body.name, placement, filling, loose, device),
@@ -158,13 +159,28 @@ def _filled(where: str, asset: Asset, spacing: float, pattern: Pattern, seed: in
         raise SceneError(f"{where}: {error}") from None
 
 
-def _surface(name: str, placement: Placement, filling: Filling, loose: bool, device: str) -> Body:
-    """The body's look: its own mesh, or a surface that may come apart."""
+def _surface(
+    name: str, placement: Placement, filling: Filling, materials: tuple[Material, ...], device: str
+) -> Body:
+    """The body's look: its own mesh, a surface that may come apart, or a fluid's."""
     asset = placement.asset
     gaussians: BoundGaussians = asset.gaussians
-    if not loose:
+    if all(item.mpm_only() is None for item in materials):
         return Body(name, gaussians.to(device), placement.surface, None)
     # Imported here: most scenes need not wait for it.
+    if all(item.model == "fluid" for item in materials):
+        from gdpro_sim.simulation.mpm.fluid_look import fluid
+
+        seen = fluid(gaussians, filling)
+        return Body(
+            name,
+            seen.gaussians.to(device),
+            placement(seen.gaussians.vertices.numpy()).astype(np.float32),
+            None,
+            patches=np.repeat(np.arange(len(filling), dtype=np.int32), 3),
+            vertex_colors=seen.vertex_colors,
+            spacing=filling.spacing,
+        )
     from gdpro_sim.simulation.mpm.look import unweld
 
     soup = unweld(gaussians.to("cpu"), filling, vertex_colors=asset.vertex_colors)
@@ -202,15 +218,7 @@ def _hold(pin: Pin, ids: np.ndarray, middle: np.ndarray) -> Hold:
     release = FOREVER if pin.release is None else pin.release
     if not pin.motion:
         return Hold(ids, None, pin.start, release)
-    motion = pin.compiled(middle, ids)
-    if pin.start > 0.0:
-        still = np.zeros((1, 3))
-        motion = replace(
-            motion,
-            times=np.insert(motion.times, 1, pin.start),
-            translations=np.concatenate([still, motion.translations]),
-            rotations=np.concatenate([still, motion.rotations]),
-        )
+    motion = pin.compiled(middle, ids, start=pin.start)
     return Hold(ids, motion, pin.start, release)
 
 
