@@ -151,6 +151,24 @@ def friction_with(table: wp.array2d[wp.float64], c: int, of_matter: float) -> fl
     return mu
 
 
+@wp.func
+def add_impulse(
+    mass: float,
+    change: wp.vec3,
+    x: wp.vec3d,
+    table: wp.array2d[wp.float64],
+    c: int,
+    pair: int,
+    impulse_out: wp.array2d[wp.float64],
+):
+    """What obstacle c takes from a node at x, which gives up a velocity."""
+    p = wp.float64(mass) * wp.vec3d(wp.float64(change[0]), wp.float64(change[1]), wp.float64(change[2]))
+    turn = wp.cross(x - row_vector(table, c, ORIGIN), p)
+    for a in range(3):
+        wp.atomic_add(impulse_out, pair, a, p[a])
+        wp.atomic_add(impulse_out, pair, 3 + a, turn[a])
+
+
 @wp.kernel
 def meet_obstacles(
     start: int,
@@ -168,6 +186,7 @@ def meet_obstacles(
     h: float,
     spacing: wp.float64,
     blocks: wp.array[wp.vec3i],
+    left: wp.array[wp.vec4],
     # Out:
     values_out: wp.array[wp.vec4],
     impulse_out: wp.array2d[wp.float64],
@@ -179,6 +198,7 @@ def meet_obstacles(
     owner:    [P] obstacle of each pair; field, gap: [64 P] and met: [P] see
               `measure_nodes` and `gather_gaps`
     friction: [64 K] Coulomb coefficient of the matter at each node
+    left:     m/s of each node that the last obstacle it meets takes from it besides; empty: none
     impulse_out: [P, 6] linear, N s, and angular, N m s about the obstacle's origin; none where it has no rows
     """
     i = (start + wp.tid()) * count
@@ -197,6 +217,8 @@ def meet_obstacles(
         if mass > 0.0:
             v = wp.vec3(value[0], value[1], value[2])
             before = v
+            x = node_position(blocks[block], n, spacing)
+            last = int(-1)
             for _sweep in range(SWEEPS):
                 held = v
                 for j in range(first, end):
@@ -206,7 +228,6 @@ def meet_obstacles(
                     kind = int(table[c, KIND])
                     open = gap[64 * pair + n]
                     if open < FAR and kind != ABSENT:
-                        x = node_position(blocks[block], n, spacing)
                         normal = wp.vec3(f[0], f[1], f[2])
                         allowed = closing_speed(open, kind, h, float(spacing)) * normal
                         u = obstacle_velocity(table, c, x) - allowed
@@ -214,18 +235,16 @@ def meet_obstacles(
                         if meets(v - u, normal, open, kind, float(spacing)):
                             mu = friction_with(table, c, friction[64 * k + n])
                             v = u + left_over(v - u, normal, kind, mu)
-                        if impulse_out.shape[0] > 0 and not (v == old):
-                            change = old - v
-                            m = wp.float64(mass)
-                            p = m * wp.vec3d(
-                                wp.float64(change[0]), wp.float64(change[1]), wp.float64(change[2])
-                            )
-                            turn = wp.cross(x - row_vector(table, c, ORIGIN), p)
-                            for a in range(3):
-                                wp.atomic_add(impulse_out, pair, a, p[a])
-                                wp.atomic_add(impulse_out, pair, 3 + a, turn[a])
+                        if not (v == old):
+                            last = pair
+                            if impulse_out.shape[0] > 0:
+                                add_impulse(mass, old - v, x, table, c, pair, impulse_out)
                 if end - first == 1 or v == held:
                     break
+            if last >= 0 and left.shape[0] > 0 and impulse_out.shape[0] > 0:
+                more = left[64 * block + n]
+                change = wp.vec3(more[0], more[1], more[2])
+                add_impulse(mass, change, x, table, owner[last], last, impulse_out)
             if not (v == before):
                 values_out[64 * block + n] = wp.vec4(v[0], v[1], v[2], mass)
 

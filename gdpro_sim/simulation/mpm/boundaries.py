@@ -24,7 +24,7 @@ from gdpro_sim.kernels.mpm_transfer import tile_width
 from gdpro_sim.simulation.collider_shapes import KINDS as COLLIDER_KINDS
 from gdpro_sim.simulation.collider_shapes import ColliderShape, placed
 from gdpro_sim.simulation.colliders import ROOM, Collider
-from gdpro_sim.simulation.conditions import FOREVER
+from gdpro_sim.simulation.conditions import FOREVER, Guide
 from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mpm.drivers import Holds, Loads
 from gdpro_sim.simulation.mpm.grid import Grid
@@ -74,17 +74,20 @@ class Obstacles:
     """The ground, the walls of the domain and all colliders of a model, those with a mass included.
 
     bodies: rigid bodies that matter moves
+    guided: numbers of the obstacles that a `Guide` moves
     """
 
     def __init__(self, model: Model) -> None:
         assert model.particles is not None
-        self.items, self.first = _obstacles(model)
+        self.items, first = _obstacles(model)
+        self._colliders = slice(first, first + len(model.colliders))
         self._walls = model.mpm.domain
         free = [c for c, item in enumerate(self.items) if item.mass is not None]
         for c in free:
             self.items[c] = recentred(self.items[c])
         self.bodies = RigidBodies([self.items[c] for c in free], model.gravity)
         self._body_of = {c: k for k, c in enumerate(free)}
+        self.guided = [c for c, item in enumerate(self.items) if isinstance(item.motion, Guide)]
         self._moving = [c for c, item in enumerate(self.items) if item.motion is not None or c in free]
         self._timed = [c for c, item in enumerate(self.items) if (item.start, item.end) != (0.0, FOREVER)]
         self._planes = [c for c, item in enumerate(self.items) if item.kind == "plane"]
@@ -108,6 +111,8 @@ class Obstacles:
         self._listed: wp.array | None = None  # the blocks that are listed
         self._empty = True
         self._impulse: wp.array = wp.zeros((0, 6), dtype=wp.float64, device=model.device)
+        self._taken: wp.array = wp.zeros((len(self.guided), 6), dtype=wp.float64, device="cpu")
+        self._nothing: wp.array = wp.zeros(0, dtype=wp.vec4, device=model.device)
         self._travel = np.zeros(len(self.items))
         self._measured = False
         self._warned = False
@@ -130,6 +135,10 @@ class Obstacles:
         self._measured = False
 
     def apply(self, grid: Grid, h: float) -> None:
+        self.meet(grid, h, self._nothing)
+
+    def meet(self, grid: Grid, h: float, left: wp.array) -> None:
+        """`apply`; the last obstacle that a node meets takes `left`, m/s of each node, from it besides."""
         if self._listed is not grid.blocks or (self._travel > MARGIN * grid.spacing).any():
             self._list(grid)
         if self._empty:
@@ -141,26 +150,22 @@ class Obstacles:
             self._measured = True
         for c, k in self._body_of.items():
             self._couple(grid, c, k, h)
-        if self._body_of:
-            self._impulse.zero_()
+        self._impulse.zero_()
         count = 64 if grid.device == "cpu" else 1
         grid.launch(
             kernels.meet_obstacles,
             len(self._near) * 64 // count,
             [
                 count, self._near, self._starts, self._order, self._owner, self._field, self._met,
-                self._gap, self._rubbing, self._table, float(h), wp.float64(grid.spacing), grid.blocks,
+                self._gap, self._rubbing, self._table, float(h), wp.float64(grid.spacing), grid.blocks, left,
             ],
             [grid.values, self._impulse],
             minimum=16 * 64 // count,
         )  # fmt: skip
-        if self._body_of:
-            given = self._impulse.numpy()
-            for c, k in self._body_of.items():
-                begin, end = self._pairs[c]
-                self.bodies.take(k, _in_order(given[begin:end]))
 
     def drive(self, grid: Grid, h: float) -> None:
+        if not self._empty:
+            self._take()
         for c in self._moving:
             linear = np.linalg.norm(self._host[c, kernels.LINEAR : kernels.SPIN])
             spin = np.linalg.norm(self._host[c, kernels.SPIN : kernels.KIND])
@@ -175,13 +180,41 @@ class Obstacles:
             grid.launch(mpm_drivers.keep_inside, items, inputs, [grid.particles], minimum=8192 // count)
 
     def state(self) -> dict[str, wp.array]:
-        return {"bodies": self.bodies.state} if self._body_of else {}
+        found = {"bodies": self.bodies.state} if self._body_of else {}
+        return found | {"impulses": self._taken} if self.guided else found
+
+    def forget(self) -> None:
+        """Count `impulses` from here on."""
+        self._taken.zero_()
+
+    def impulses(self) -> np.ndarray:
+        """[C, 6] N s and N m s about the world's origin that the model's colliders took from matter.
+
+        0 for those that are not guided.
+        """
+        found = np.zeros((len(self.items), 6))
+        found[self.guided] = self._taken.numpy()
+        return found[self._colliders]
+
+    def _take(self) -> None:
+        """Give obstacles what they took from matter when it last met them."""
+        if not self.guided and not self._body_of:
+            return
+        given = self._impulse.numpy()
+        for c, k in self._body_of.items():
+            begin, end = self._pairs[c]
+            self.bodies.take(k, _in_order(given[begin:end]))
+        for taken, c in zip(self._taken.numpy(), self.guided, strict=True):
+            begin, end = self._pairs[c]
+            impulse = _in_order(given[begin:end])
+            impulse[3:] += np.cross(self._host[c, kernels.ORIGIN : kernels.ROTATION], impulse[:3])
+            taken += impulse
 
     def poses(self) -> list[tuple[np.ndarray, np.ndarray] | None]:
         """For each of the model's colliders: its rigid motion since the start, where it has a mass."""
         return [
             self.bodies.pose(self._body_of[c]) if c in self._body_of else None
-            for c in range(self.first, len(self.items) - (6 if self._walls is not None else 0))
+            for c in range(len(self.items))[self._colliders]
         ]
 
     def _is_there(self, c: int) -> bool:
@@ -233,7 +266,7 @@ class Obstacles:
         self._where = grid.set("obstacles.where", where, int)
         self._field = grid.array("obstacles.field", 64 * len(block), wp.vec4)
         self._rubbing = grid.array("obstacles.friction", 64 * len(near), float)
-        if self._body_of:
+        if self._body_of or self.guided:
             self._impulse = _table(grid, "obstacles.impulse", len(block), 6)
             self._sums = {
                 c: _table(grid, f"obstacles.coupling.{c}", len(found[c]), kernels.SUMS)

@@ -12,7 +12,7 @@ import warp as wp
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import linalg, mpm_implicit, mpm_newton, mpm_stiffness
 from gdpro_sim.simulation.model import Model
-from gdpro_sim.simulation.mpm.boundaries import Boundary
+from gdpro_sim.simulation.mpm.boundaries import Boundary, Obstacles
 from gdpro_sim.simulation.mpm.grid import Grid
 from gdpro_sim.simulation.mpm.matter import Matter, flows
 
@@ -70,6 +70,7 @@ class GridNewton:
         particles, settings = model.particles, model.mpm
         self.grid, self.boundaries, self.settings = grid, boundaries, settings
         self.table = matter.table
+        self._guided = [b for b in boundaries if isinstance(b, Obstacles) and b.guided]
         self._iterations = 0
         volumes = particles.volumes.astype(np.float64)
         moduli = np.array([lam + 2.0 * mu for lam, mu in (m.lame for m in matter.materials)])
@@ -162,6 +163,25 @@ class GridNewton:
             if length == 0.0 and not settled:
                 break
         return Outcome(False, math.isfinite(energy), residual, done, self._iterations)
+
+    def account(self, h: float) -> None:
+        """Let guided obstacles count what they took from the velocities that `solve` has left.
+
+        That is what they take from velocities without boundaries. Where the solution is not quite what
+        boundaries make of those, they take the difference too, so that no momentum is lost.
+        """
+        values, found = self.grid.values, self._start
+        for obstacles in self._guided:
+            wp.copy(found, values)
+            self.energy(h)
+            self.linearise(h)
+            self._over_nodes(mpm_newton.unbounded, [self._momentum, self._force], [self._unbounded])
+            wp.copy(values, self._unbounded)
+            self._apply(h)
+            self._over_nodes(mpm_newton.combine, [values, -1.0, found], [self._step])
+            wp.copy(values, self._unbounded)
+            obstacles.meet(self.grid, h, self._step)
+            wp.copy(values, found)
 
     def _balance(self) -> None:
         """Give all nodes the velocity that conjugate gradients, which stop early, have left out."""

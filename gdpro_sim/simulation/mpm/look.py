@@ -329,13 +329,8 @@ def _grains(bound: BoundGaussians, filling: Filling, most: int) -> BoundGaussian
         return None
     chosen, sigma = chosen[keep], sigma[keep]
     normals = face_normals(bound.vertices.detach().numpy(), bound.faces.numpy())[face[keep]]
-    splats = bound.gaussians()
-    near = min(COLOR_NEIGHBOURS, len(splats))
-    distance, who = cKDTree(splats.means.double().numpy()).query(points[chosen], k=np.arange(1, near + 1))
-    mix = splats.opacities.double().numpy()[who] / np.maximum(distance, 1e-3 * spacing) ** 2
-    colors = np.einsum("nk,nkc->nc", mix / mix.sum(1, keepdims=True), splats.sh[:, 0].double().numpy()[who])
     sh = torch.zeros((len(chosen), bound.sh.shape[1], 3))
-    sh[:, 0] = torch.from_numpy(colors)
+    sh[:, 0] = colors_around(bound, points[chosen], spacing)
     return bind_splats(
         Gaussians(
             torch.from_numpy(filling.points[chosen]),
@@ -345,6 +340,19 @@ def _grains(bound: BoundGaussians, filling: Filling, most: int) -> BoundGaussian
             sh,
         )
     )
+
+
+def colors_around(bound: BoundGaussians, points: np.ndarray, spacing: float) -> torch.Tensor:
+    """Harmonics of degree 0, [n, 3] float32, of the Gaussians nearest to `points` [n, 3] m, mixed.
+
+    They count by opacity and by the inverse square of their distance, down to a thousandth of `spacing`.
+    """
+    splats = bound.to("cpu").gaussians()
+    near = min(COLOR_NEIGHBOURS, len(splats))
+    distance, who = cKDTree(splats.means.double().numpy()).query(points, k=np.arange(1, near + 1))
+    mix = splats.opacities.double().numpy()[who] / np.maximum(distance, 1e-3 * spacing) ** 2
+    mixed = np.einsum("nk,nkc->nc", mix / mix.sum(1, keepdims=True), splats.sh[:, 0].double().numpy()[who])
+    return torch.from_numpy(mixed.astype(np.float32))
 
 
 def _thinned(points: np.ndarray, spacing: float, most: int) -> np.ndarray:
@@ -369,4 +377,4 @@ def _facing(normals: np.ndarray) -> np.ndarray:
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-__all__ = ["Look", "Unwelded", "unweld"]
+__all__ = ["Look", "Unwelded", "colors_around", "unweld"]

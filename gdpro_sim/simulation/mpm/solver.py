@@ -62,6 +62,7 @@ class SolverMPM:
         self._rest = particles.positions
         self._looks: dict[int, Any] = {}
         self.boundaries = boundaries(model)
+        self._obstacles = next((b for b in self.boundaries if isinstance(b, Obstacles)), None)
         self._affine = 0.0 if settings.transfer == "pic" else 1.0
         self._flip = settings.flip_ratio if settings.transfer == "flip" else 0.0
         self._newton = None
@@ -145,6 +146,8 @@ class SolverMPM:
     def _advance(self, dt: float) -> None:
         begin, done, settings = self._time, 0.0, self.model.mpm
         self._counters = _Counters()
+        if self._obstacles is not None:
+            self._obstacles.forget()
         self.grid.sort()
         while done < dt:
             left = dt - done
@@ -225,6 +228,7 @@ class SolverMPM:
                 f"no implicit substep of {h:.3g} s is possible at t = {self._time:.6g} s: raise the "
                 "substeps, or check velocities and material constants"
             )
+        newton.account(h)
         counters.converged &= outcome.converged
         counters.residual = max(counters.residual, outcome.residual)
         return h
@@ -242,15 +246,21 @@ class SolverMPM:
 
     def surface_positions(self, body: int) -> np.ndarray:
         """Deformed surface vertices of body number `body`, [V, 3] float32 m, world."""
-        from gdpro_sim.simulation.mpm.look import Look  # compiles kernels
+        from gdpro_sim.simulation.mpm.fluid_look import FluidLook  # both compile kernels
+        from gdpro_sim.simulation.mpm.look import Look
 
-        begin, end = self.model.bodies[body].particle_range
+        item = self.model.bodies[body]
+        begin, end = item.particle_range
+        positions = self.positions[begin:end].astype(np.float32)
         look = self._looks.get(body)
-        if look is None:
-            item, rest = self.model.bodies[body], self._rest[begin:end]
-            look = Look(item.surface, rest, patches=item.patches, device=self.model.device)
-            self._looks[body] = look
-        return look.surface(self.positions[begin:end].astype(np.float32), self.deformations[begin:end])
+        if look is None and item.spacing is not None:
+            look = FluidLook(end - begin, item.spacing, device=self.model.device)
+        elif look is None:
+            look = Look(item.surface, self._rest[begin:end], patches=item.patches, device=self.model.device)
+        self._looks[body] = look
+        if isinstance(look, FluidLook):
+            return look.surface(positions)
+        return look.surface(positions, self.deformations[begin:end])
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Everything needed to continue to the same bytes, after whole steps."""
@@ -278,6 +288,16 @@ class SolverMPM:
         self._time = float(state["time"])
         grid.sort()
 
+    def collider_impulses(self) -> np.ndarray:
+        """[C, 6] N s and N m s about the world's origin that matter gave each of `Model.colliders`.
+
+        In the last step, summed over its substeps; 0 before any, and for those that are not guided (whose
+        motion is no `gdpro_sim.simulation.conditions.Guide`).
+        """
+        if self._obstacles is None:
+            return np.zeros((len(self.model.colliders), 6))
+        return self._obstacles.impulses()
+
     def diagnostics(self) -> Diagnostics:
         """Figures of the last step (of the initial state before any)."""
         grid = self.grid
@@ -291,7 +311,8 @@ class SolverMPM:
         angular = (mass * (np.cross(x, v) + inertia * spin)).sum(0)
         gravity = np.asarray(self.model.gravity, np.float64)
         height = -float((mass * x).sum(0) @ gravity)
-        for bodies in (b.bodies for b in self.boundaries if isinstance(b, Obstacles)):  # free rigid ones
+        if self._obstacles is not None:
+            bodies = self._obstacles.bodies  # free rigid ones
             kinetic += bodies.kinetic_energy
             momentum, angular = momentum + bodies.momentum, angular + bodies.angular_momentum
             height -= float(bodies.mass @ bodies.positions @ gravity)
