@@ -55,6 +55,8 @@ class SolverMuJoCo:
     mjmodel, mjdata: MuJoCo's own; actuators of a base may be driven through `mjdata.ctrl` between steps
     renamed:         (our name, the name taken) of bodies whose names a base had already
     counted:         [nbody] bool, bodies that diagnostics count: not the obstacles that are moved
+    wrenches:        [nbody, 6] N and N m about the centre of mass, world axes: they push bodies in every step
+                     until they are changed, and are no part of the state
 
     Raises SceneError for a scene that MuJoCo cannot compile.
     """
@@ -78,6 +80,7 @@ class SolverMuJoCo:
         self._driven = list(self._driven_bodies())
         driven = {self.mjmodel.body(name).id for name, *_ in self._driven}
         self.counted = np.array([i not in driven for i in range(self.mjmodel.nbody)])
+        self.wrenches = np.zeros((self.mjmodel.nbody, 6))
         self._count = _Count()
         self.reset()
 
@@ -107,8 +110,7 @@ class SolverMuJoCo:
         """Advance by `dt` seconds, in equal parts no longer than the time step of the settings."""
         if not (math.isfinite(dt) and dt > 0.0):
             raise SolverError(f"dt must be > 0 s, got {dt}")
-        assert self.model.mujoco is not None
-        count = max(1, math.ceil(dt / self.model.mujoco.settings.timestep - 1e-9))
+        count = self.substeps(dt)
         before = self._state()
         model, data = self.mjmodel, self.mjdata
         model.opt.timestep = dt / count
@@ -118,6 +120,7 @@ class SolverMuJoCo:
         begin = data.time
         for k in range(count):
             self._drive(begin + k * dt / count, dt / count)
+            data.xfrc_applied[:] = self.wrenches
             mujoco.mj_step(model, data)
             rounds = int(np.max(data.solver_niter)) if data.nefc else 0
             result.iterations += rounds
@@ -211,6 +214,16 @@ class SolverMuJoCo:
         number = self.mjmodel.body(self.world.names[body]).id
         turn = self._view.xmat[number].reshape(3, 3).copy()
         return turn, self._view.xpos[number] - turn @ item.centre
+
+    def substeps(self, dt: float) -> int:
+        """MuJoCo's own steps in a `step(dt)`."""
+        assert self.model.mujoco is not None
+        return max(1, math.ceil(dt / self.model.mujoco.settings.timestep - 1e-9))
+
+    def frames(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations [B, 3, 3] and centres of mass [B, 3] m of MuJoCo's own bodies by their `numbers` [B]."""
+        turns = self._view.xmat[numbers].reshape(-1, 3, 3)
+        return turns.copy(), self._view.xipos[numbers].copy()
 
     def vertices(self, body: int) -> np.ndarray:
         """Positions [P, 3] float64 m of a soft body's vertices."""
