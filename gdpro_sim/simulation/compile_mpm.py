@@ -84,10 +84,9 @@ def compile_particles(
         columns["gradients"].append(np.broadcast_to(spin, (count, 3, 3)))
         columns["volumes"].append(filling.volumes)
         columns["matter"].append(matter)
-        loose = any(item.mpm_only() is not None for item in made)
         bodies.append(
             replace(
-                _surface(body.name, placement, filling, loose, device),
+                _surface(body.name, placement, filling, made, device),
                 particle_range=(begin, begin + count),
             )
         )

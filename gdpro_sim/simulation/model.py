@@ -30,6 +30,8 @@ class Body:
     patches:        [V] int32, ascending: the patch each surface vertex belongs to, where the surface may come
                     apart (`gdpro_sim.simulation.mpm.look.unweld`); None: it stays whole
     vertex_colors:  [V, 3] float32 sRGB of a surface that is not the asset's; None: the asset's
+    spacing:        m, between the particles of a fluid, whose surface is made of them in every frame
+                    (`gdpro_sim.simulation.mpm.fluid_look`); None: it is carried along
     """
 
     name: str
@@ -41,6 +43,7 @@ class Body:
     particle_range: tuple[int, int] = (0, 0)
     patches: np.ndarray | None = None
     vertex_colors: np.ndarray | None = None
+    spacing: float | None = None
 
 
 @dataclass(frozen=True)
@@ -160,6 +163,42 @@ class MpmSettings:
     cg_tolerance: float = 1e-2
 
 
+PartName = Literal["fem", "mpm", "mujoco"]
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid body that soft ones meet.
+
+    body:      number in `MujocoWorld.bodies`; of one of the base, its number in the base's own MuJoCo model
+    colliders: its solid where it starts, without a motion
+    """
+
+    body: int
+    of_base: bool
+    colliders: tuple[Collider, ...]
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Several solvers in one scene: rigid bodies in MuJoCo, soft ones in FEM and MPM.
+
+    parts:      the model of each solver; "mujoco" is always there, the others where they have bodies
+    places:     of each of `Model.bodies`: its solver, and its number there
+    links:      rigid bodies that move, which the parts do not hold as colliders
+    step:       s at most, after which the solvers agree anew
+    iterations: at most, of one step, until they agree
+    tolerance:  m/s, by which a rigid body may move otherwise than soft ones were told
+    """
+
+    parts: dict[PartName, Model]
+    places: tuple[tuple[PartName, int], ...]
+    links: tuple[Link, ...] = ()
+    step: float = 2e-3
+    iterations: int = 10
+    tolerance: float = 2e-3
+
+
 @dataclass(frozen=True)
 class Model:
     """A compiled scene: everything constant. Arrays are float32 / int32 NumPy, SI units, world space.
@@ -179,6 +218,7 @@ class Model:
     yield_stress, hardening: [T] Pa, of elements with the law "stvk_hencky"; inf does not yield; None: none do
     particles:   material points of the bodies that MPM simulates; None: FEM simulates tets
     mujoco:      rigid and soft bodies that MuJoCo simulates, in the order of `bodies`; None: others simulate
+    coupling:    several solvers' models, whose arrays stand here, too; None: one solver simulates all
     """
 
     bodies: tuple[Body, ...]
@@ -210,6 +250,7 @@ class Model:
     holds: tuple[Hold, ...] = ()
     mpm: MpmSettings = MpmSettings()
     mujoco: MujocoWorld | None = None
+    coupling: Coupling | None = None
 
     @staticmethod
     def of_particles(
@@ -302,12 +343,15 @@ class Solver(Protocol):
 
 __all__ = [
     "Body",
+    "Coupling",
     "Diagnostics",
     "FemSettings",
     "Ground",
     "Integrator",
+    "Link",
     "Model",
     "MpmSettings",
+    "PartName",
     "Particles",
     "Solver",
 ]
