@@ -91,11 +91,12 @@ def find_surface(
     for j in wp.hash_grid_query(cells, x, radius):
         d = positions[j] - x
         squared = wp.dot(d, d)
-        w = bump(squared, radius)
-        total += w
-        close += bump(squared, CLOSE * spacing)
-        mean += w * d
-        second += w * wp.outer(d, d)
+        if squared < radius * radius:
+            w = bump(squared, radius)
+            total += w
+            close += bump(squared, CLOSE * spacing)
+            mean += w * d
+            second += w * wp.outer(d, d)
     mean = mean / total
     second = second / total - wp.outer(mean, mean)
     axes, squares = wp.eig3(second)
@@ -143,12 +144,15 @@ def smooth_normals(
     x = positions[i]
     total = wp.vec3()
     for j in wp.hash_grid_query(cells, x, radius):
-        d = positions[j] - x
-        agreement = wp.dot(n, normals[j])
-        if agreement < 0.0:
-            agreement = agreement * film[i] * wp.where(surface[i] < 0.5, 1.0, 0.0)
-        w = bump(wp.dot(d, d), radius) * (wp.max(surface[j], film[j]) + 0.02) * agreement
-        total += w * normals[j]
+        seen = wp.max(surface[j], film[j])
+        if seen > 0.0:
+            d = positions[j] - x
+            squared = wp.dot(d, d)
+            if squared < radius * radius:
+                agreement = wp.dot(n, normals[j])
+                if agreement < 0.0:
+                    agreement = agreement * film[i] * wp.where(surface[i] < 0.5, 1.0, 0.0)
+                total += bump(squared, radius) * seen * agreement * normals[j]
     normals_out[i] = some_normal(total, n)
 
 
@@ -193,14 +197,17 @@ def smooth_heights(
     total = float(0.0)
     height = float(0.0)
     for j in wp.hash_grid_query(cells, x, radius):
-        agreement = wp.dot(n, normals[j])
-        off = wp.dot(disks[j] - p, n)
-        if agreement > 0.0 and wp.abs(off) < STRAY * spacing:
+        if surface[j] > 0.0:
             d = positions[j] - x
-            agreement = agreement * agreement
-            w = bump(wp.dot(d, d), radius) * agreement * agreement * surface[j] * surface[j]
-            total += w
-            height += w * off
+            squared = wp.dot(d, d)
+            if squared < radius * radius:
+                agreement = wp.dot(n, normals[j])
+                off = wp.dot(disks[j] - p, n)
+                if agreement > 0.0 and wp.abs(off) < STRAY * spacing:
+                    agreement = agreement * agreement
+                    w = bump(squared, radius) * agreement * agreement * surface[j] * surface[j]
+                    total += w
+                    height += w * off
     disks_out[i] = p + surface[i] * height / wp.max(total, 1.0e-12) * n
 
 
