@@ -177,6 +177,8 @@ class Collider:
     velocity, angular_velocity: m/s and rad/s at the start, of one with a mass
     visible:  whether pictures show it
     vertices, faces: [V, 3] float64 m and [F, 3] int32 of a closed mesh, in its own frame
+    heights:  [NY, NX] m of the terrain that the mesh is, over the rectangle that it covers
+    color:    sRGB in pictures; None: that of obstacles
     """
 
     name: str
@@ -196,6 +198,8 @@ class Collider:
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     angular_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     visible: bool = True
+    heights: np.ndarray | None = None
+    color: tuple[float, float, float] | None = None
 
     @staticmethod
     def floor(height: float) -> Collider:
@@ -225,22 +229,24 @@ def compile_collider(options: ColliderOptions, resolve: Callable[[str], Path] = 
         common["rotation"] = rotation @ _turned_to(np.asarray(options.normal))
         return Collider(kind="plane", **common)
     if isinstance(options, BoxCollider):
-        half = 0.5 * np.asarray(options.size)
-        return Collider(kind="box", size=_three(*half), room=ROOM * float(half.min()), **common)
+        return shape_collider("box", tuple(0.5 * edge for edge in options.size), **common)
     if isinstance(options, SphereCollider):
-        return Collider(kind="sphere", size=_three(options.radius), room=ROOM * options.radius, **common)
-    if isinstance(options, CapsuleCollider):
-        size = _three(options.radius, 0.5 * options.length)
-        return Collider(kind="capsule", size=size, room=ROOM * options.radius, **common)
-    if isinstance(options, CylinderCollider):
-        size = _three(options.radius, 0.5 * options.length)
-        return Collider(kind="cylinder", size=size, room=ROOM * min(size[:2]), **common)
+        return shape_collider("sphere", (options.radius,), **common)
+    if isinstance(options, CapsuleCollider | CylinderCollider):
+        return shape_collider(options.kind, (options.radius, 0.5 * options.length), **common)
     if isinstance(options, MeshCollider):
         mesh = load_mesh(resolve(options.file), up=options.up)
         vertices, faces = options.scale * mesh.vertices.astype(np.float64), mesh.faces
     else:
-        vertices, faces = _terrain(np.asarray(options.heights), options.size)
+        common["heights"] = np.asarray(options.heights, np.float64)
+        vertices, faces = _terrain(common["heights"], options.size)
     return mesh_collider(vertices, faces, **common)
+
+
+def shape_collider(kind: Kind, size: tuple[float, ...], **common: Any) -> Collider:
+    """A `Collider` of a box, sphere, capsule or cylinder; `size` in m as in `Collider`."""
+    room = ROOM * (size[0] if kind == "capsule" else min(size))
+    return Collider(kind=kind, size=_three(*size), room=room, **common)
 
 
 def mesh_collider(vertices: np.ndarray, faces: np.ndarray, *, name: str = "mesh", **common: Any) -> Collider:
@@ -323,4 +329,5 @@ __all__ = [
     "SphereCollider",
     "compile_collider",
     "mesh_collider",
+    "shape_collider",
 ]

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from gdpro_sim.materials import Material
+from gdpro_sim.simulation.copies import Copied, Copies
 from gdpro_sim.simulation.forces import ConstantForce, Pin, Push, SurfacePressure
 from gdpro_sim.simulation.mujoco_options import MujocoBody
 from gdpro_sim.simulation.options import Options, Vector, several
@@ -60,6 +61,9 @@ class SceneBody(Options):
     rotation: Vector = Field(default=(0.0, 0.0, 0.0), description="degrees about X, then Y, then Z")
     velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="m/s")
     angular_velocity: Vector = Field(default=(0.0, 0.0, 0.0), description="rad/s about the body's centre")
+    copies: Copies | None = Field(
+        default=None, description="several of it; where bodies are named, its name stands for all of them"
+    )
     material: Material | None = Field(
         default=None, description="preset name or values; default: the asset's, else jelly"
     )
@@ -71,7 +75,14 @@ class SceneBody(Options):
     impulses: tuple[Push, ...] = Field(default=(), description="pushes at a time")
     pressures: tuple[SurfacePressure, ...] = Field(default=(), description="on parts of its surface")
 
+    solver: Literal["auto", "fem", "mpm", "mujoco"] = Field(
+        default="auto",
+        description="in a coupled scene; auto: mpm for what flows or tears, mujoco for what has a `mujoco` "
+        "entry or a Young's modulus of 1e8 Pa or more, else fem",
+    )
     mujoco: MujocoBody | None = Field(default=None, description="what it is to the MuJoCo solver")
+
+    copied: Copied | None = Field(default=None, description="set by `copies`")
 
     @field_validator("parts", "pins", "forces", "impulses", "pressures", mode="before")
     @classmethod
@@ -89,6 +100,11 @@ class SceneBody(Options):
             safe = "".join(ch if ch.isascii() and ch.isalnum() else "_" for ch in stem)
             value = {**value, "name": safe if safe[:1].isalpha() else f"body_{safe}"}
         return value
+
+    @property
+    def source(self) -> str:
+        """What its asset is named by: copies share one."""
+        return self.name if self.copied is None else self.copied.group
 
     @model_validator(mode="after")
     def _one_source(self) -> SceneBody:

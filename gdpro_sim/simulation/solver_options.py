@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from gdpro_sim.simulation.model import FemSettings, Integrator, MpmSettings
+from gdpro_sim.simulation.model import Coupling, FemSettings, Integrator, MpmSettings
 from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.options import Options, Vector
 
@@ -129,6 +129,36 @@ class MpmOptions(Options):
         return MpmSettings(**{**kept, "grid_spacing": grid_spacing})
 
 
-SolverOptions = Annotated[FemOptions | MpmOptions | MujocoOptions, Field(discriminator="kind")]
+class CoupledOptions(Options):
+    """Rigid bodies in MuJoCo that meet soft ones in FEM and MPM, two ways; each body may say its `solver`."""
 
-__all__ = ["FemOptions", "MpmOptions", "SolverOptions"]
+    kind: Literal["coupled"] = "coupled"
+    step: float = Field(
+        default=Coupling.step, gt=0.0, le=0.05, description="s, at most, after which the solvers agree anew"
+    )
+    iterations: int = Field(
+        default=Coupling.iterations, ge=1, le=100,
+        description="at most, of a step until they agree; else it is halved",
+    )  # fmt: skip
+    tolerance: float = Field(
+        default=Coupling.tolerance, gt=0.0,
+        description="m/s, by which a rigid body may move otherwise than what it met was told",
+    )  # fmt: skip
+    fem: FemOptions = Field(default_factory=FemOptions, description="of the bodies in FEM")
+    mpm: MpmOptions = Field(default_factory=MpmOptions, description="of the bodies in MPM")
+    mujoco: MujocoOptions = Field(default_factory=MujocoOptions, description="of the rigid bodies")
+
+    @model_validator(mode="after")
+    def _in_time(self) -> CoupledOptions:
+        if self.fem.integrator == "quasi-static":
+            raise ValueError(
+                "fem.integrator: quasi-static steps have no duration for bodies to push in; choose another"
+            )
+        return self
+
+
+SolverOptions = Annotated[
+    FemOptions | MpmOptions | MujocoOptions | CoupledOptions, Field(discriminator="kind")
+]
+
+__all__ = ["CoupledOptions", "FemOptions", "MpmOptions", "SolverOptions"]

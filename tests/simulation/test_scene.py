@@ -79,7 +79,7 @@ def test_defaults_and_relative_paths(tmp_path: Path) -> None:
         (MINIMAL + "    size: 0", "size: must be greater than 0"),
         (MINIMAL + "  - asset: other/thing.ply", "two bodies are named 'thing'"),
         (MINIMAL + "camera: {width: 33}", "width: must be even"),
-        (MINIMAL + "solver: {kind: mpn}", "solver.kind: must be 'fem', 'mpm', 'mujoco', got 'mpn'"),
+        (MINIMAL + "solver: {kind: mpn}", "solver.kind: must be 'fem', 'mpm', 'mujoco', .*got 'mpn'"),
         (MINIMAL + "duration: 0", "duration: must be greater than 0"),
         (MINIMAL + "folder: /", "unknown key `folder`"),
         (MINIMAL + "fps: 0", "fps: must be greater than or equal to 1, got 0"),
