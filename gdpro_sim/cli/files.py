@@ -144,6 +144,9 @@ def simulate(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Start again instead of continuing a stopped run.")
     ] = False,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Run the Python files that the scene names.")
+    ] = False,
     json_output: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -161,7 +164,9 @@ def simulate(
     from gdpro_sim.io.record import record
 
     with progress(quiet) as report:
-        recording = record(checked, output, device=device, fresh=fresh, on_progress=report)
+        recording = record(
+            checked, output, device=device, fresh=fresh, allow_code=allow_code, on_progress=report
+        )
     if json_output:
         print(json.dumps(recording.to_json()))
     elif not quiet:

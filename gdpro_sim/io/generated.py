@@ -28,12 +28,15 @@ def with_generated(
     call made there for the same prompt, quality and seed is used again. Raises GuidanceError, OutputError.
     """
     bodies = []
+    made: dict[str, Path] = {}
     for body in scene.bodies:
         if body.prompt is None:
             bodies.append(body)
             continue
-        path = _generate(body, scene.seed, Path(output), device, on_progress or (lambda *_: None))
-        bodies.append(body.model_copy(update={"prompt": None, "asset": str(path.resolve())}))
+        if body.source not in made:
+            report = on_progress or (lambda *_: None)
+            made[body.source] = _generate(body, scene.seed, Path(output), device, report)
+        bodies.append(body.model_copy(update={"prompt": None, "asset": str(made[body.source].resolve())}))
     return scene.model_copy(update={"bodies": tuple(bodies)})
 
 
@@ -41,7 +44,7 @@ def _generate(
     body: SceneBody, seed: int, output: Path, device: str, report: Callable[[str, int, int], None]
 ) -> Path:
     config = load_config(body.quality)
-    folder = prepare_folder(output / "generated" / body.name, "run.json")
+    folder = prepare_folder(output / "generated" / body.source, "run.json")
     path = folder.with_suffix(".usdc")
     request = Request(Inputs(prompt=body.prompt or "").pinned(), config, seed)
     if path.exists():

@@ -46,6 +46,11 @@ class Obstacles:
             bound = bind_mesh(mesh, budget=max(BUDGET, 2 * len(faces)), occlusion=0.0).to(device)
             self._items.append((number, collider, bound))
 
+    @property
+    def counts(self) -> list[tuple[int, int]]:
+        """(number of an obstacle, its Gaussians) of those that are shown, in the order of `added_to`."""
+        return [(number, len(bound)) for number, _, bound in self._items]
+
     def added_to(
         self, gaussians: Gaussians, normals: torch.Tensor, time: float, poses: np.ndarray | None = None
     ) -> tuple[Gaussians, torch.Tensor]:
@@ -72,9 +77,10 @@ class Obstacles:
 
 
 def with_obstacles(
-    colliders: Sequence[Collider], low: np.ndarray, high: np.ndarray
+    colliders: Sequence[Collider], low: np.ndarray, high: np.ndarray, duration: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The box `low`..`high` in m, grown to show obstacles wherever they move, unless they are far larger."""
+    """The box `low`..`high` in m, grown to show obstacles wherever they move in `duration` s, unless they are
+    far larger."""
     size = float(np.linalg.norm(high - low))
     boxes = [(low, high)]
     for collider in colliders:
@@ -83,7 +89,7 @@ def with_obstacles(
         points = _surface(collider, low, high)[0] @ collider.rotation.T + collider.position
         if np.linalg.norm(np.ptp(points, axis=0)) > LARGE * size:
             continue
-        for time in collider.motion.times.tolist() if isinstance(collider.motion, Motion) else (0.0,):
+        for time in collider.motion.sampled(duration) if isinstance(collider.motion, Motion) else (0.0,):
             moved = points
             if collider.motion is not None:
                 rotation, shift = pose_at(collider.motion, time)

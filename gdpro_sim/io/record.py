@@ -24,7 +24,6 @@ from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import RequestError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
-from gdpro_sim.io.facing import Facing
 from gdpro_sim.io.images import (
     frame_name,
     read_png,
@@ -35,15 +34,18 @@ from gdpro_sim.io.images import (
     write_video,
 )
 from gdpro_sim.io.obstacles import Obstacles, with_obstacles
-from gdpro_sim.io.preview import Renderer, Studio, frame_camera
+from gdpro_sim.io.preview import Studio
 from gdpro_sim.io.resume import Store, StoredFrame
+from gdpro_sim.io.staging import Scenery, Staging, named_cameras
 from gdpro_sim.io.usd import SimulationWriter, body_records
-from gdpro_sim.simulation.compile import check_files, load_assets
+from gdpro_sim.simulation.callbacks import Callback, callbacks_of, with_code
+from gdpro_sim.simulation.compile import check_files, check_supported, load_assets
 from gdpro_sim.simulation.model import Diagnostics
 from gdpro_sim.simulation.placement import material_of
 from gdpro_sim.simulation.run import Simulation
 from gdpro_sim.simulation.scene import Scene, load_scene
 from gdpro_sim.simulation.scene_body import SceneBody
+from gdpro_sim.simulation.view import MAIN
 
 Progress = Callable[[str, int, int], None]
 """Called with (phase, done, total); total 0 means the length is not known."""
@@ -79,6 +81,7 @@ class Recording:
     gaussians: int
     tets: int
     particles: int
+    more_videos: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -94,34 +97,38 @@ def record(
     *,
     device: str = "auto",
     fresh: bool = False,
+    allow_code: bool = False,
     on_progress: Progress | None = None,
 ) -> Recording:
     """Simulate `scene` and write its results into the folder `output`.
+
+    `allow_code` lets the Python files run that the scene names (`motion: {callback: …}`).
 
     A run of the same scene that was interrupted there is continued, unless `fresh`. Raises RequestError (also
     SceneError, MeshError, AssetError, DeviceError) before anything runs, SolverError or OutputError later;
     finished frames stay on disk and the next call continues after them.
     """
-    checked = scene if isinstance(scene, Scene) else load_scene(scene)
+    checked = with_code(scene if isinstance(scene, Scene) else load_scene(scene), allow_code)
     device = resolve_device(device)
     report = on_progress or (lambda phase, done, total: None)
     begin = time.perf_counter()
     seconds: dict[str, float] = {}
+    check_supported(checked)
     if any(body.prompt is not None for body in checked.bodies):
         from gdpro_sim.io.generated import with_generated
 
         checked = with_generated(checked, output, device=device, on_progress=report)
         seconds["generate"] = time.perf_counter() - begin
     check_files(checked)
-    names = [body.name for body in checked.bodies]
+    names = list(dict.fromkeys(body.source for body in checked.bodies))
     file_names = ["asset.usdc" if len(names) == 1 else f"asset_{name}.usdc" for name in names]
     asset_paths = [Path(output) / file for file in file_names]
     _keep_inputs(checked, asset_paths)
     folder = prepare_folder(output, "simulation.usdc")
-    frames = prepare_folder(folder / "frames", frame_name(0))
     remove_stale(folder)
-    remove_stale(frames)
-    store = Store(folder / ".resume", _fingerprint(checked, device), fresh)
+    for name in _drawn(checked):
+        remove_stale(prepare_folder(folder / named("frames", name), frame_name(0)))
+    store = Store(folder / ".resume", fingerprint(checked, device), fresh)
 
     begin = time.perf_counter()
     report("prepare", 0, 0)
@@ -133,20 +140,20 @@ def record(
     simulation = Simulation(checked, assets, device=device)
     seconds["prepare"] = time.perf_counter() - begin
 
-    low, high = _reach(checked, simulation)
-    studio = _studio(checked, simulation)
-    renderer = Renderer(frame_camera(low, high, **checked.camera.model_dump()), studio)
-    preview = {"low": low.tolist(), "high": high.tolist(), "studio": asdict(studio)}
+    low, high = reach(checked, simulation)
+    studio = studio_of(checked, simulation)
+    bodies = [(body.name, body.gaussians) for body in simulation.model.bodies]
+    times = np.arange(len(simulation)) / checked.fps
+    cameras = named_cameras(checked.camera, checked.cameras)
+    staging = Staging(cameras, checked.lights, low, high, times, bodies, studio)
+    preview = {"low": low.tolist(), "high": high.tolist(), "studio": asdict(staging.studio)}
     obstacles = Obstacles(simulation.model.colliders, low, high, device)
-    rows = _run(simulation, folder, store, renderer, obstacles, preview, report)
+    scenery = Scenery([bound for _, bound in bodies], obstacles, staging.studio, device)
+    rows = _run(simulation, folder, store, staging, scenery, preview, report)
 
     begin = time.perf_counter()
-    pictures = [frames / frame_name(i) for i in range(len(simulation))]
-    remove_frames_from(frames, len(simulation))
-    write_video(folder / "preview.mp4", _read_all(pictures, report), checked.fps)
-    chosen = spread(len(pictures), 12)
-    labels = [f"t = {i / checked.fps:.2f} s" for i in chosen]
-    write_contact_sheet(folder / "contact_sheet.png", [read_png(pictures[i]) for i in chosen], labels)
+    for name in _drawn(checked):
+        _write_film(folder, name, len(simulation), checked.fps, report)
     _write_metrics(folder / "metrics.csv", rows)
     seconds.update(
         {phase: sum(row[f"ms_{phase}"] for row in rows[store.resumed :]) / 1e3 for phase in PHASES}
@@ -158,8 +165,9 @@ def record(
         output=folder,
         assets=asset_paths,
         simulation=folder / "simulation.usdc",
-        frames=frames,
+        frames=folder / "frames",
         video=folder / "preview.mp4",
+        more_videos=[str(folder / named("preview.mp4", c.name)) for c in checked.cameras if c.preview],
         contact_sheet=folder / "contact_sheet.png",
         metrics=folder / "metrics.csv",
         frame_count=len(simulation),
@@ -175,8 +183,8 @@ def _run(
     simulation: Simulation,
     folder: Path,
     store: Store,
-    renderer: Renderer,
-    obstacles: Obstacles,
+    staging: Staging,
+    scenery: Scenery,
     preview: dict[str, Any],
     report: Progress,
 ) -> list[dict[str, Any]]:
@@ -184,7 +192,6 @@ def _run(
     total = len(simulation)
     explicit = simulation.model.particles is not None and simulation.model.mpm.integrator == "explicit"
     rows: list[dict[str, Any]] = []
-    facing = Facing([body.gaussians for body in simulation.model.bodies], renderer.cameras[0])
     report("simulate", 0, total)
     simulation.solver.reset()
     scene = simulation.scene
@@ -217,16 +224,14 @@ def _run(
             frame = simulation.frame(index, done.surfaces, done.diagnostics, done.colliders)
 
             begin = time.perf_counter()
-            path = folder / "frames" / frame_name(index)
-            picture = None
-            if stored is None or not path.exists():
-                normals = facing.normals(done.surfaces)
-                shown = obstacles.added_to(frame.gaussians(), normals, frame.time, frame.colliders)
-                picture = renderer.render(*shown)
+            shot = staging.next(done.surfaces)
+            paths = {n: folder / named("frames", n) / frame_name(index) for n in _drawn(scene)}
+            missing = [n for n, path in paths.items() if stored is None or not path.exists()]
+            pictures = scenery.draw(frame, shot, missing)
             drawn = time.perf_counter()
-            if picture is not None:
-                write_png(path, picture)
-            writer.add(frame)
+            for name, (picture, _) in pictures.items():
+                write_png(paths[name], picture)
+            writer.add(frame, shot)
             if stored is None:
                 store.save(index, done, simulation.solver.state_dict())
             written = time.perf_counter()
@@ -242,6 +247,29 @@ def _run(
         begin = time.perf_counter()
     rows[-1]["ms_write"] += 1e3 * (time.perf_counter() - begin)
     return rows
+
+
+def named(file: str, camera: str) -> str:
+    """Name of a folder or file of one camera: the main one's is `file` itself."""
+    stem, dot, suffix = file.partition(".")
+    return file if camera == MAIN else f"{stem}_{camera}{dot}{suffix}"
+
+
+def _drawn(scene: Scene) -> list[str]:
+    """Cameras whose pictures a run draws."""
+    return [MAIN, *(camera.name for camera in scene.cameras if camera.preview)]
+
+
+def _write_film(folder: Path, camera: str, count: int, fps: float, report: Progress) -> None:
+    """Video and contact sheet of one camera."""
+    frames = folder / named("frames", camera)
+    pictures = [frames / frame_name(i) for i in range(count)]
+    remove_frames_from(frames, count)
+    write_video(folder / named("preview.mp4", camera), _read_all(pictures, report), fps)
+    chosen = spread(count, 12)
+    labels = [f"t = {i / fps:.2f} s" for i in chosen]
+    sheet = folder / named("contact_sheet.png", camera)
+    write_contact_sheet(sheet, [read_png(pictures[i]) for i in chosen], labels)
 
 
 def _read_all(pictures: list[Path], report: Progress) -> Iterator[np.ndarray]:
@@ -281,7 +309,7 @@ def _write_metrics(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+def reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box in m that the camera should show: flight, landing and slide of every body."""
     boxes = []
     for body, placed in zip(scene.bodies, simulation.model.bodies, strict=True):
@@ -292,7 +320,7 @@ def _reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray
         if placed.patches is not None:
             boxes.append(_spread(boxes[-1], simulation.model.mpm.domain))
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    low, high = with_obstacles(simulation.model.colliders, low, high)
+    low, high = with_obstacles(simulation.model.colliders, low, high, scene.duration)
     if scene.ground is not None:
         low[2] = min(low[2], scene.ground.height)
         spread_out = 0.12 * (high[:2] - low[:2])
@@ -320,9 +348,9 @@ def _spread(
 def _path(scene: Scene, body: SceneBody, low: np.ndarray, size: float, friction: float) -> list[np.ndarray]:
     """Where a body is likely to go, as shifts of its box: a throw, then a slide that friction ends."""
     if body.pins:
-        keys = [key.translation for pin in body.pins for key in pin.motion]
+        keys = [shift for pin in body.pins for shift in pin.shifts(scene.duration)]
         sag = np.array([0.0, 0.0, -0.3 * size])
-        return [np.zeros(3), sag, *(np.asarray(way) for way in keys), *(way + sag for way in keys)]
+        return [np.zeros(3), sag, *keys, *(way + sag for way in keys)]
     shifts: list[np.ndarray] = []
     velocity, gravity = np.asarray(body.velocity), np.asarray(scene.gravity)
     for t in np.linspace(0.0, scene.duration, 60):
@@ -340,12 +368,14 @@ def _path(scene: Scene, body: SceneBody, low: np.ndarray, size: float, friction:
     return shifts
 
 
-def _studio(scene: Scene, simulation: Simulation) -> Studio:
+def studio_of(scene: Scene, simulation: Simulation) -> Studio:
     sizes = [float(np.ptp(body.surface, axis=0).max()) for body in simulation.model.bodies]
     middle = np.mean([body.surface.mean(axis=0) for body in simulation.model.bodies], axis=0)
     return Studio(
         shading=scene.render.shading,
         background=scene.render.background,
+        exposure=scene.render.exposure,
+        catch_shadows=scene.render.catch_shadows,
         ground=None if scene.ground is None else scene.ground.height,
         scale=max(sizes),
         focus=(float(middle[0]), float(middle[1]), float(middle[2])),
@@ -357,7 +387,7 @@ def _save_assets(assets: dict[str, Asset], names: list[str], paths: list[Path]) 
         assets[name].save(path)
 
 
-def _fingerprint(scene: Scene, device: str) -> str:
+def fingerprint(scene: Scene, device: str) -> str:
     """Hash of what decides the frames: scene, files (and those of the same stem), device, versions."""
     versions = f"{gdpro_sim.__version__} {RESUME_FORMAT} {wp.config.version}"
     digest = hashlib.sha256(f"{versions}\n{device}\n{scene.model_dump_json()}".encode())
@@ -367,7 +397,21 @@ def _fingerprint(scene: Scene, device: str) -> str:
         for file in sorted({path, *beside}):
             if file.is_file():
                 digest.update(sha256_of(file).encode())
+    for callback in callbacks_of(scene):
+        digest.update(_sampled(scene, callback))
     return digest.hexdigest()
+
+
+def _sampled(scene: Scene, callback: Callback) -> bytes:
+    """What a function of time gives at every frame, until it fails: it may depend on more than its file."""
+    values = []
+    for index in range(scene.frame_count):
+        try:
+            values.append(repr(callback.function(index / scene.fps)))  # type: ignore[misc]
+        except Exception as error:  # the run will say it when it comes there
+            values.append(type(error).__name__)
+            break
+    return "\n".join(values).encode()
 
 
 def _keep_inputs(scene: Scene, outputs: list[Path]) -> None:
@@ -380,4 +424,4 @@ def _keep_inputs(scene: Scene, outputs: list[Path]) -> None:
             )
 
 
-__all__ = ["Recording", "record"]
+__all__ = ["Recording", "fingerprint", "reach", "record", "studio_of"]

@@ -18,15 +18,18 @@ from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.colliders import MeshCollider, compile_collider
 from gdpro_sim.simulation.compile_coupled import as_part, compile_coupled, part_of
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
+from gdpro_sim.simulation.compile_mpm import check_supported as mpm_supports
 from gdpro_sim.simulation.compile_mpm import compile_particles
+from gdpro_sim.simulation.compile_mujoco import check_supported as mujoco_supports
 from gdpro_sim.simulation.compile_mujoco import compile_mujoco, prepare
+from gdpro_sim.simulation.copies import colored
 from gdpro_sim.simulation.group_materials import materials_at
 from gdpro_sim.simulation.model import Body, Ground, Model
 from gdpro_sim.simulation.mujoco_options import MujocoOptions
-from gdpro_sim.simulation.placement import material_of, place
+from gdpro_sim.simulation.placement import material_of, place_bodies
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.scene_body import SceneBody
-from gdpro_sim.simulation.solver_options import CoupledOptions, MpmOptions
+from gdpro_sim.simulation.solver_options import CoupledOptions, FemOptions, MpmOptions
 
 log = logging.getLogger(__name__)
 
@@ -63,57 +66,87 @@ def load_assets(
 ) -> dict[str, Asset]:
     """The asset of every body, with tets where the solver needs them, by body name; meshes are imported.
 
-    `stored` names asset files of an earlier run of the same scene: they are taken as they are, because
+    Copies of a body share one, in their colours, which stands as it is under the body's own name. `stored`
+    names asset files of an earlier run of the same scene, by body: they are taken as they are, because
     tetrahedralization is not repeatable. Raises MeshError, AssetError or SceneError.
     """
     check_files(scene)
+    check_supported(scene)
     tell = on_progress or (lambda phase: None)
     assets: dict[str, Asset] = {}
     for body in scene.bodies:
-        if stored and body.name in stored:
-            assets[body.name] = Asset.load(stored[body.name])
-            continue
-        path = scene.resolve(body.asset)
-        tell(f"preparing {body.name}")
-        if kind(path) == "asset":
-            ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
-            if ignored:
-                raise SceneError(
-                    f"{scene.name}: bodies[{body.name}].{ignored[0]}: applies to a mesh, but {path.name} is "
-                    f"an asset with colours of its own; remove the key"
-                )
-            asset = Asset.load(path)
-        else:
-            asset = import_mesh(
-                path,
-                name=body.name,
-                budget=body.budget,
-                color=body.color,
-                texture=None if body.texture is None else scene.resolve(body.texture),
-                up=body.up,
-                tets=part_of(scene, body) == "fem",
-                target_tets=body.tets,
-                seed=scene.seed,
-                on_progress=tell,
+        if body.source not in assets:
+            assets[body.source] = (
+                Asset.load(stored[body.source])
+                if stored and body.source in stored
+                else _load_asset(scene, body, tell)
             )
-        part = part_of(scene, body, asset)
-        if asset.gaussians.is_loose and part != "mpm":
-            raise SceneError(
-                f"{scene.name}: body {body.name!r}: {path.name} is a splat cloud without a mesh, which only "
-                "MPM can simulate (`solver: {kind: mpm}`); `gdpro generate --from-splat` makes an asset with "
-                "a mesh"
-            )
-        if part == "mujoco":
-            asset = prepare(as_part(scene, body), asset, tell)
-        if asset.tets is None and part == "fem":
-            # At the asset's own size: the caller may place several bodies of one asset at several sizes.
-            asset = tetrahedralize_asset(asset, target_tets=body.tets, on_progress=tell)
-        if asset.material is None or body.material is not None:
-            asset = replace(asset, material=material_of(body, asset))
-        if body.material is not None:
-            asset = replace(asset, group_materials={})
-        assets[body.name] = asset
+        if body.copied is not None:
+            asset = assets[body.source]
+            color = body.copied.color
+            assets[body.name] = asset if color is None else colored(asset, color)
     return assets
+
+
+def _load_asset(scene: Scene, body: SceneBody, tell: Callable[[str], None]) -> Asset:
+    path = scene.resolve(body.asset)
+    tell(f"preparing {body.source}")
+    if kind(path) == "asset":
+        ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
+        if ignored:
+            raise SceneError(
+                f"{scene.name}: bodies[{body.source}].{ignored[0]}: applies to a mesh, but {path.name} is "
+                f"an asset with colours of its own; remove the key"
+            )
+        asset = Asset.load(path)
+    else:
+        asset = import_mesh(
+            path,
+            name=body.source,
+            budget=body.budget,
+            color=body.color,
+            texture=None if body.texture is None else scene.resolve(body.texture),
+            up=body.up,
+            tets=part_of(scene, body) == "fem",
+            target_tets=body.tets,
+            seed=scene.seed,
+            on_progress=tell,
+        )
+    part = part_of(scene, body, asset)
+    if asset.gaussians.is_loose and part != "mpm":
+        raise SceneError(
+            f"{scene.name}: body {body.source!r}: {path.name} is a splat cloud without a mesh, which only "
+            "MPM can simulate (`solver: {kind: mpm}`); `gdpro generate --from-splat` makes an asset with "
+            "a mesh"
+        )
+    if part == "mujoco":
+        asset = prepare(as_part(scene, body), asset, tell)
+    if asset.tets is None and part == "fem":
+        # At the asset's own size: the caller may place several bodies of one asset at several sizes.
+        asset = tetrahedralize_asset(asset, target_tets=body.tets, on_progress=tell)
+    if asset.material is None or body.material is not None:
+        asset = replace(asset, material=material_of(body, asset))
+    if body.material is not None:
+        asset = replace(asset, group_materials={})
+    return asset
+
+
+def check_supported(scene: Scene) -> None:
+    """Raise SceneError for what the scene's solver cannot do, as far as the scene alone says it."""
+    if isinstance(scene.solver, MpmOptions):
+        mpm_supports(scene)
+    elif isinstance(scene.solver, MujocoOptions):
+        mujoco_supports(scene)
+    elif isinstance(scene.solver, FemOptions):
+        for body in scene.bodies:
+            if body.material is not None:
+                _check_elements(f"{scene.name}: body {body.name!r}", body, (body.material,))
+            for k, pin in enumerate(body.pins):
+                if pin.start > 0.0:
+                    raise SceneError(
+                        f"{scene.name}: bodies[{body.name}].pins[{k}].start: belongs to MPM (`solver: "
+                        "{kind: mpm}`)"
+                    )
 
 
 def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu") -> Model:
@@ -140,15 +173,13 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         )
     }  # fmt: skip
     vertex_begin = tet_begin = 0
-    for body in scene.bodies:
-        asset = assets[body.name]
+    offsets: dict[int, np.ndarray] = {}
+    for body, placement in zip(scene.bodies, place_bodies(scene, assets), strict=True):
+        asset = placement.asset
         where = f"{scene.name}: body {body.name!r}"
         if asset.tets is None or asset.embedding is None:
             raise SceneError(f"{where}: its asset has no tetrahedra")
         _check_vertices(where, asset.tets)
-        placement = place(scene, body, asset)
-        asset = placement.asset
-        assert asset.tets is not None and asset.embedding is not None
         made, matter = materials_at(body, asset, asset.tets.vertices[asset.tets.tets].mean(axis=1))
         _check_elements(where, body, made)
         vertices = placement(asset.tets.vertices)
@@ -166,12 +197,11 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         columns["law"].append(np.array([m.law for m in made], np.int32)[matter])
         _, touching = materials_at(body, asset, asset.tets.vertices)
         columns["friction"].append(np.array([m.friction for m in made], np.float32)[touching])
-        rest = asset.gaussians.vertices.cpu().numpy().astype(np.float64)
-        columns["contact_offset"].append(
-            distance_outside(asset.tets.vertices, rest, asset.gaussians.faces.cpu().numpy()).astype(
-                np.float32
-            )
-        )
+        if id(asset.tets) not in offsets:  # copies share theirs
+            rest = asset.gaussians.vertices.cpu().numpy().astype(np.float64)
+            faces = asset.gaussians.faces.cpu().numpy()
+            offsets[id(asset.tets)] = distance_outside(asset.tets.vertices, rest, faces).astype(np.float32)
+        columns["contact_offset"].append(offsets[id(asset.tets)])
         bodies.append(
             Body(
                 name=body.name,
@@ -180,6 +210,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
                 embedding=asset.embedding,
                 vertex_range=(vertex_begin, vertex_begin + count),
                 tet_range=(tet_begin, tet_begin + len(asset.tets.tets)),
+                placement=placement,
             )
         )
         vertex_begin += count
@@ -235,4 +266,4 @@ def _centre_of_mass(tets: TetMesh, vertices: np.ndarray, density: np.ndarray) ->
     return (mass[:, None] * vertices[tets.tets].mean(axis=1)).sum(axis=0) / mass.sum()
 
 
-__all__ = ["check_files", "compile_scene", "load_assets"]
+__all__ = ["check_files", "check_supported", "compile_scene", "load_assets"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,8 +14,11 @@ from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.callbacks import Callback
 from gdpro_sim.simulation.conditions import FOREVER, Force, Impulse, Load, Motion, Pressure, Springs, Wind
+from gdpro_sim.simulation.copies import members
 from gdpro_sim.simulation.forces import Attachment, Pin, Spring, SpringEnd
 from gdpro_sim.simulation.model import Body, Model
+from gdpro_sim.simulation.painting import painted_points
+from gdpro_sim.simulation.placement import Placement
 from gdpro_sim.simulation.regions import Region
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.scene_body import SceneBody
@@ -48,9 +51,7 @@ def apply_conditions(scene: Scene, model: Model) -> Model:
         loads += compile_pressures(body, item)
     loads += compile_winds(scene, by_name)
     springs = [compile_spring(scene, k, spring, by_name) for k, spring in enumerate(scene.springs)]
-    for k, ties in enumerate(scene.attachments):
-        a, b = (by_name[name] for name in ties.bodies)
-        ids = tied(scene, k, ties, a, b)
+    for _, ties, a, b, ids in tied(scene, by_name):
         if ties.stiffness is None:
             # Imported here: it brings the solver's kernels, which most scenes need not wait for yet.
             from gdpro_sim.simulation.fem.rest import rest_shapes
@@ -76,11 +77,21 @@ class Placed:
     first:  number of its first point in the model
     points: [n, 3] float64 m
     kind:   "vertex" or "particle"
+    placement: of its asset; None: its regions are where it stands, and none is painted
     """
 
-    def __init__(self, scene: Scene, name: str, points: np.ndarray, first: int, kind: str = "vertex") -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        name: str,
+        points: np.ndarray,
+        first: int,
+        kind: str = "vertex",
+        placement: Placement | None = None,
+    ) -> None:
         self.name, self.where = name, f"{scene.name}: bodies[{name}]"
         self.points, self.first, self.kind = points.astype(np.float64), first, kind
+        self.placement = placement
 
     @property
     def size(self) -> float:
@@ -93,8 +104,11 @@ class Placed:
                 f"{self.where}.{key}.vertices: counts vertices of tets, which a body of particles has not; "
                 "give a box, a sphere or a side"
             )
+        if region.painted is not None or region.group is not None:
+            return self._painted(region, key)
+        points = self.points if self.placement is None else self.placement.as_written(self.points)
         try:
-            ids = np.flatnonzero(region.select(self.points))
+            ids = np.flatnonzero(region.select(points))
         except IndexError as error:
             raise SceneError(
                 f"{self.where}.{key}.vertices: no vertex {error}; the body has {len(self.points)}, from 0"
@@ -105,8 +119,23 @@ class Placed:
             )
         return ids
 
+    def _painted(self, region: Region, key: str) -> np.ndarray:
+        """Points under the painted part of the surface."""
+        if self.placement is None:
+            raise SceneError(f"{self.where}.{key}: this body has no surface to paint; give a box or a sphere")
+        chosen = self.placement.painted(f"{self.where}.{key}", region)
+        return painted_points(self.points, self.placement, chosen, region.depth)
+
+    def motion(self, pin: Pin, held: np.ndarray, vertices: np.ndarray) -> Motion:
+        """Of a pin that holds points `held` of the body, for `vertices` of the model."""
+        motion = pin.compiled(self.points[held].mean(axis=0), vertices, start=pin.start)
+        if pin.pivot is None or self.placement is None:
+            return motion
+        return replace(motion, pivot=self.placement.from_written(motion.pivot))
+
     def span(self) -> str:
-        low, high = (np.round(corner, 3).tolist() for corner in (self.points.min(0), self.points.max(0)))
+        points = self.points if self.placement is None else self.placement.as_written(self.points)
+        low, high = (np.round(corner, 3).tolist() for corner in (points.min(0), points.max(0)))
         return f"the body spans {low} to {high} m"
 
 
@@ -119,13 +148,18 @@ class Faced(Placed):
         """Corners [n, 4] int32 of the model and weights [n, 4] that carry points [n, 3] m along."""
         raise NotImplementedError
 
+    def place(self, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Where corners [4] of the model with weights [4] carry a point at the start, [3] m."""
+        placed: np.ndarray = weights @ self.points[corners - self.first]
+        return placed
+
 
 class Tets(Faced):
     """A body of tets [t, 4], from its own first vertex."""
 
     def __init__(self, scene: Scene, body: Body, model: Model) -> None:
         first, end = body.vertex_range
-        super().__init__(scene, body.name, model.vertices[first:end], first)
+        super().__init__(scene, body.name, model.vertices[first:end], first, placement=body.placement)
         self.tets = model.tets[slice(*body.tet_range)] - np.int32(first)
         self.faces, _ = boundary(self.tets)
 
@@ -166,14 +200,14 @@ def _pins(body: SceneBody, item: Tets, pinned: np.ndarray, release: np.ndarray) 
         if pin.release is not None:
             release[item.first + ids] = pin.release
         if pin.motion and len(ids):
-            yield pin.compiled(item.points[held].mean(axis=0), item.first + ids)
+            yield item.motion(pin, held, item.first + ids)
 
 
 def _agree(a: Pin, a_ids: np.ndarray, b: Pin, b_ids: np.ndarray) -> bool:
     if (a.motion, a.pivot, a.start, a.release) != (b.motion, b.pivot, b.start, b.release):
         return False
-    scripted = isinstance(a.motion, Callback)
-    turns = a.pivot is None and (scripted or any(any(key.rotation) for key in a.motion))
+    turning = isinstance(a.motion, Callback) or any(any(key.rotation) for key in a.motion)
+    turns = a.pivot is None and turning
     return not turns or np.array_equal(a_ids, b_ids)
 
 
@@ -219,55 +253,124 @@ def _masses(item: Tets, model: Model) -> np.ndarray:
 
 def compile_winds(scene: Scene, bodies: Mapping[str, Faced]) -> Iterator[Load]:
     """Air on the surfaces of bodies."""
+    named = members(scene.bodies)
     for air in scene.wind:
-        chosen = [bodies[name] for name in dict.fromkeys(air.bodies or bodies)]
+        names = bodies if air.bodies is None else [name for given in air.bodies for name in named[given]]
+        chosen = [bodies[name] for name in dict.fromkeys(names)]
         faces = np.concatenate([body.faces + body.first for body in chosen])
         end = FOREVER if air.end is None else air.end
         yield Wind(faces, air.velocity, air.density, air.drag, air.lift, air.start, end)
 
 
 def compile_spring(scene: Scene, k: int, spring: Spring, bodies: Mapping[str, Faced]) -> Springs:
-    """One spring. Raises SceneError for an end away from its body."""
-    ends = [_end(f"{scene.name}: springs[{k}].ends[{e}]", end, bodies) for e, end in enumerate(spring.ends)]
-    length = spring.rest_length
-    if length is None:
-        length = float(np.linalg.norm(ends[0][3] - ends[1][3]))
-    each = [np.array([value]) for value in (spring.stiffness, length, spring.damping)]
-    corners, weights, anchors = (np.stack([[end[part] for end in ends]]) for part in range(3))
+    """One spring, or one for each copy. Raises SceneError for an end away from its body.
+
+    What is written for the first copy holds for all: the same point of each, and the world's moved along.
+    """
+    where, named = f"{scene.name}: springs[{k}]", members(scene.bodies)
+    groups = [[None] if end.body is None else named[end.body] for end in spring.ends]
+    count = max(len(group) for group in groups)
+    if any(len(group) not in (1, count) for group in groups):
+        names = " and ".join(repr(end.body) for end in spring.ends)
+        raise SceneError(f"{where}: {names} are not equally many, so copies cannot be joined one to one")
+    ends: list[list[_End]] = []
+    for e, (end, group) in enumerate(zip(spring.ends, groups, strict=True)):
+        first = _end(f"{where}.ends[{e}]", end, None if group[0] is None else bodies[group[0]])
+        ends.append([first])
+        for name in group[1:]:
+            first_body, body = bodies[str(group[0])], bodies[str(name)]
+            corners = first.corners + np.int32(body.first - first_body.first)
+            ends[e].append(_End(corners, first.weights, np.zeros(3), body.place(corners, first.weights)))
+    for one, other in (ends, ends[::-1]):
+        for copy in other[len(one) :]:
+            shift = copy.place - other[0].place if not one[0].weights.any() else np.zeros(3)
+            one.append(replace(one[0], anchor=one[0].anchor + shift, place=one[0].place + shift))
+    a, b = (np.array([end.place for end in one]) for one in ends)
+    length = np.linalg.norm(a - b, axis=1) if spring.rest_length is None else spring.rest_length
+    corners, weights, anchors = (
+        np.stack([np.stack([getattr(end, part) for end in one]) for one in ends], axis=1)
+        for part in ("corners", "weights", "anchor")
+    )
+    each = [np.full(count, value) for value in (spring.stiffness, length, spring.damping)]
     return Springs(corners, weights, anchors, *each)
 
 
-def _end(
-    where: str, end: SpringEnd, bodies: Mapping[str, Faced]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class _End:
     """Corners [4], weights [4], anchor [3] m, and where it is at the start [3] m."""
-    if end.body is None:
+
+    corners: np.ndarray
+    weights: np.ndarray
+    anchor: np.ndarray
+    place: np.ndarray
+
+
+def _end(where: str, end: SpringEnd, body: Faced | None) -> _End:
+    if body is None:
         point = np.asarray(end.point)
-        return np.zeros(4, np.int32), np.zeros(4), point, point
-    body = bodies[end.body]
+        return _End(np.zeros(4, np.int32), np.zeros(4), point, point)
     if end.vertex is not None:
         if end.vertex >= len(body.points):
             raise SceneError(
-                f"{where}.vertex: no vertex {end.vertex}; {end.body!r} has {len(body.points)}, from 0"
+                f"{where}.vertex: no vertex {end.vertex}; {body.name!r} has {len(body.points)}, from 0"
             )
         corners, weights = np.full(4, body.first + end.vertex), np.array([1.0, 0.0, 0.0, 0.0])
-        return corners.astype(np.int32), weights, np.zeros(3), body.points[end.vertex]
+        return _End(corners.astype(np.int32), weights, np.zeros(3), body.points[end.vertex])
     point = np.asarray(end.point)
     away = float(distance_outside(point[None], body.points, body.faces)[0])
     if away > END_OUTSIDE * body.size:
-        raise SceneError(f"{where}.point: lies {away:.3g} m outside {end.body!r}; {body.span()}")
+        raise SceneError(f"{where}.point: lies {away:.3g} m outside {body.name!r}; {body.span()}")
     corners, weights = body.carried(point[None])
-    return corners[0], weights[0], np.zeros(3), point
+    return _End(corners[0], weights[0], np.zeros(3), point)
 
 
-def tied(scene: Scene, k: int, ties: Attachment, a: Faced, b: Faced) -> np.ndarray:
-    """Points on the surface of `a`, from its first, that are tied to `b`. Raises SceneError for none."""
+Tied = tuple[int, Attachment, Faced, Faced, np.ndarray]
+
+
+def tied(scene: Scene, bodies: Mapping[str, Faced]) -> Iterator[Tied]:
+    """Attachments by number, the bodies that each ties, and the tied points of the first body, from its first.
+
+    They lie on its surface. One that names copies ties all pairs that are near enough. Raises SceneError for
+    one that ties none.
+    """
+    named = members(scene.bodies)
+    for k, ties in enumerate(scene.attachments):
+        first, second = (named[name] for name in ties.bodies)
+        pairs = [(bodies[a], bodies[b]) for a in first for b in second]
+        found: list[Tied] = []
+        for a, b in pairs:
+            if len(pairs) > 1 and _gap(a, b) > _reach(ties, a):
+                continue
+            try:
+                found.append((k, ties, a, b, _tied(scene, k, ties, a, b)))
+            except SceneError:
+                if len(pairs) == 1:
+                    raise
+        if not found:
+            raise SceneError(
+                f"{scene.name}: attachments[{k}]: no copies of {ties.bodies[0]!r} and {ties.bodies[1]!r} are "
+                f"near enough to tie; move them together, or raise `distance`"
+            )
+        yield from found
+
+
+def _reach(ties: Attachment, a: Faced) -> float:
+    return TIE_DISTANCE * a.size if ties.distance is None else ties.distance
+
+
+def _gap(a: Faced, b: Faced) -> float:
+    """Between the boxes of two bodies, m."""
+    apart = np.maximum(a.points.min(0) - b.points.max(0), b.points.min(0) - a.points.max(0))
+    return float(np.linalg.norm(np.maximum(apart, 0.0)))
+
+
+def _tied(scene: Scene, k: int, ties: Attachment, a: Faced, b: Faced) -> np.ndarray:
     where = f"{scene.name}: attachments[{k}]"
     ids = np.unique(a.faces)
     if ties.chosen:
         ids = np.intersect1d(ids, a.select(ties, f"attachments[{k}]"))
     away = distance_outside(a.points[ids], b.points, b.faces)
-    reach = TIE_DISTANCE * a.size if ties.distance is None else ties.distance
+    reach = _reach(ties, a)
     if not (away <= reach).any():
         nearest = f"; the nearest is {away.min():.3g} m away" if len(ids) else ""
         raise SceneError(

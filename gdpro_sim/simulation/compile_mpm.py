@@ -18,11 +18,10 @@ from gdpro_sim.meshing.repair import validate
 from gdpro_sim.simulation.colliders import compile_collider
 from gdpro_sim.simulation.compile_forces import Placed, chosen_pins, compile_pushes
 from gdpro_sim.simulation.conditions import FOREVER, Hold, Load
-from gdpro_sim.simulation.forces import Pin
 from gdpro_sim.simulation.group_materials import materials_at
 from gdpro_sim.simulation.model import Body, Ground, Model, MpmSettings, Particles
 from gdpro_sim.simulation.mpm.matter import flows
-from gdpro_sim.simulation.placement import Placement, place
+from gdpro_sim.simulation.placement import Placement, place_bodies
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.solver_options import MpmOptions
 
@@ -48,9 +47,10 @@ def compile_particles(
     Bodies that flow or tear get surfaces that may come apart. Raises SceneError for what MPM cannot do,
     bodies that cannot be filled, overlap or stand outside the walls, and steps too short or grids too large.
     """
-    _check_supported(scene)
-    placements = [place(scene, body, assets[body.name]) for body in scene.bodies]
-    spacings, grid_spacing = _resolution(scene, options, placements)
+    check_supported(scene)
+    placements = place_bodies(scene, assets)
+    fillings: Fillings = {}
+    spacings, grid_spacing = _resolution(scene, options, placements, fillings)
     materials: dict[Material, int] = {}
     bodies: list[Body] = []
     columns: dict[str, list[np.ndarray]] = {
@@ -59,7 +59,7 @@ def compile_particles(
     begin = 0
     for body, placement, spacing in zip(scene.bodies, placements, spacings, strict=True):
         where = f"{scene.name}: body {body.name!r}"
-        filling = _filled(where, placement.asset, spacing, options.fill, scene.seed)
+        filling = _filled(where, placement.asset, spacing, options.fill, scene.seed, fillings)
         points = placement(filling.points)
         volumes = filling.volumes.astype(np.float64)
         count = len(filling)
@@ -72,7 +72,7 @@ def compile_particles(
             )
         numbers = np.array([materials.setdefault(item, len(materials)) for item in made], np.int32)
         matter = numbers[within]
-        chosen = Placed(scene, body.name, points, begin, "particle")
+        chosen = Placed(scene, body.name, points, begin, "particle", placement)
         for k, part in enumerate(body.parts):
             matter[chosen.select(part, f"parts[{k}]")] = numbers[len(own) + k]
         density = np.array([item.density for item in materials])[matter]
@@ -88,6 +88,7 @@ def compile_particles(
             replace(
                 _surface(body.name, placement, filling, made, device),
                 particle_range=(begin, begin + count),
+                placement=placement,
             )
         )
         begin += count
@@ -116,14 +117,21 @@ def compile_particles(
 # ---- filling ----
 
 
-def _resolution(scene: Scene, options: MpmOptions, placements: list[Placement]) -> tuple[list[float], float]:
+Fillings = dict[tuple[int, float, str, int], Filling]
+
+
+def _resolution(
+    scene: Scene, options: MpmOptions, placements: list[Placement], known: Fillings
+) -> tuple[list[float], float]:
     """Distance between particles of each body, and the grid's, m."""
     cell = options.particles_per_cell ** (1.0 / 3.0)
     wanted = [body.particles for body in scene.bodies]
     volumes = []
     for body, placement in zip(scene.bodies, placements, strict=True):
         size = float(np.ptp(placement.surface, axis=0).max())
-        rough = _filled(f"{scene.name}: body {body.name!r}", placement.asset, size / ROUGH, "lattice", 0)
+        rough = _filled(
+            f"{scene.name}: body {body.name!r}", placement.asset, size / ROUGH, "lattice", 0, known
+        )
         volumes.append(float(rough.volumes.sum(dtype=np.float64)))
     if options.grid_spacing is not None:
         common = options.grid_spacing / cell
@@ -145,8 +153,20 @@ def _resolution(scene: Scene, options: MpmOptions, placements: list[Placement]) 
     return spacings, grid_spacing
 
 
-def _filled(where: str, asset: Asset, spacing: float, pattern: Pattern, seed: int) -> Filling:
-    """In the asset's frame: of its mesh; of its tets, where it has some and its mesh is open."""
+def _filled(
+    where: str, asset: Asset, spacing: float, pattern: Pattern, seed: int, known: Fillings
+) -> Filling:
+    """In the asset's frame: of its mesh; of its tets, where it has some and its mesh is open.
+
+    `known` holds those made before: copies share them.
+    """
+    key = id(asset.gaussians.vertices), spacing, pattern, seed
+    if key not in known:
+        known[key] = _fill(where, asset, spacing, pattern, seed)
+    return known[key]
+
+
+def _fill(where: str, asset: Asset, spacing: float, pattern: Pattern, seed: int) -> Filling:
     bound = asset.gaussians
     try:
         if asset.tets is not None:
@@ -206,26 +226,20 @@ def _with_conditions(scene: Scene, model: Model) -> Model:
     mass = particles.volumes.astype(np.float64) * density[particles.matter]
     for body, placed in zip(scene.bodies, model.bodies, strict=True):
         part = slice(*placed.particle_range)
-        item = Placed(scene, body.name, particles.positions[part], part.start, "particle")
+        item = Placed(scene, body.name, particles.positions[part], part.start, "particle", placed.placement)
         for pin, ids in zip(body.pins, chosen_pins(body, item), strict=True):
-            holds.append(_hold(pin, (item.first + ids).astype(np.int32), item.points[ids].mean(axis=0)))
+            release = FOREVER if pin.release is None else pin.release
+            held = (item.first + ids).astype(np.int32)
+            holds.append(Hold(held, item.motion(pin, ids, held) if pin.motion else None, pin.start, release))
         loads += compile_pushes(body, item, mass[part])
     return replace(model, holds=tuple(holds), loads=tuple(loads))
-
-
-def _hold(pin: Pin, ids: np.ndarray, middle: np.ndarray) -> Hold:
-    release = FOREVER if pin.release is None else pin.release
-    if not pin.motion:
-        return Hold(ids, None, pin.start, release)
-    motion = pin.compiled(middle, ids, start=pin.start)
-    return Hold(ids, motion, pin.start, release)
 
 
 # ---- checks ----
 
 
-def _check_supported(scene: Scene) -> None:
-    """Raise SceneError for what only FEM can do."""
+def check_supported(scene: Scene) -> None:
+    """Raise SceneError for what only other solvers can do, as far as a scene alone says it."""
     absent = {
         "wind": bool(scene.wind),
         "springs": bool(scene.springs),
@@ -310,4 +324,4 @@ def _check_substeps(scene: Scene, particles: Particles, settings: MpmSettings, s
             )
 
 
-__all__ = ["compile_particles"]
+__all__ = ["check_supported", "compile_particles"]

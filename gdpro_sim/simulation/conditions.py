@@ -8,12 +8,18 @@ Loads act from `start` to `end` in s; a step takes the share of it that they act
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gdpro_sim.errors import SolverError
+
 FOREVER = math.inf
+
+SAMPLES = 60
+"""Times at which a function is looked at to see where it goes."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +32,7 @@ class Motion:
     translations: [K, 3] m, from where they start; linear in between
     rotations:    [K, 3] rad, rotation vectors: about one axis in between where two have one axis, which may
                   be more than a full turn, else along the shortest way; the first of both are 0
+    function:     in place of the keyframes, where there is one: time in s -> translation [3] m and rotation
     """
 
     vertices: np.ndarray
@@ -33,6 +40,38 @@ class Motion:
     times: np.ndarray
     translations: np.ndarray
     rotations: np.ndarray
+    function: Callable[[float], tuple[np.ndarray, Rotation]] | None = None
+
+    def sampled(self, duration: float) -> list[float]:
+        """Times in s that show where it goes within `duration` s: keyframes; many, until a function fails."""
+        if self.function is None:
+            return [float(time) for time in self.times]
+        times: list[float] = []
+        for time in np.linspace(0.0, duration, SAMPLES).tolist():
+            try:
+                self.function(time)
+            except SolverError:  # the run will say it when it comes there
+                break
+            times.append(time)
+        return times
+
+    def at(self, time: float) -> tuple[np.ndarray, Rotation]:
+        """Translation [3] m and rotation at a time in s."""
+        if self.function is not None:
+            return self.function(time)
+        times = self.times
+        k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
+        shift, turn = self.translations[k], Rotation.from_rotvec(self.rotations[k])
+        if k + 1 < len(times):
+            share = (time - times[k]) / (times[k + 1] - times[k])
+            shift = (1.0 - share) * shift + share * self.translations[k + 1]
+            a, b = self.rotations[k], self.rotations[k + 1]
+            if np.linalg.norm(np.cross(a, b)) <= 1e-9 * np.linalg.norm(a) * np.linalg.norm(b):
+                turn = Rotation.from_rotvec((1.0 - share) * a + share * b)
+            else:
+                way = (Rotation.from_rotvec(b) * turn.inv()).as_rotvec()
+                turn = Rotation.from_rotvec(share * way) * turn
+        return shift, turn
 
 
 Pose = tuple[np.ndarray, np.ndarray]
@@ -69,18 +108,7 @@ def pose_at(motion: Motion | Guide, time: float) -> Pose:
     """Where a motion is at a time in s."""
     if isinstance(motion, Guide):
         return motion.pose(time)
-    times = motion.times
-    k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
-    shift, turn = motion.translations[k], Rotation.from_rotvec(motion.rotations[k])
-    if k + 1 < len(times):
-        share = (time - times[k]) / (times[k + 1] - times[k])
-        shift = (1.0 - share) * shift + share * motion.translations[k + 1]
-        a, b = motion.rotations[k], motion.rotations[k + 1]
-        if np.linalg.norm(np.cross(a, b)) <= 1e-9 * np.linalg.norm(a) * np.linalg.norm(b):
-            turn = Rotation.from_rotvec((1.0 - share) * a + share * b)
-        else:
-            way = (Rotation.from_rotvec(b) * turn.inv()).as_rotvec()
-            turn = Rotation.from_rotvec(share * way) * turn
+    shift, turn = motion.at(time)
     matrix = turn.as_matrix()
     return matrix, motion.pivot - matrix @ motion.pivot + shift
 

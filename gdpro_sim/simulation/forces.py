@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
+from gdpro_sim.simulation.callbacks import Callback
 from gdpro_sim.simulation.motions import Moving
 from gdpro_sim.simulation.options import Options, Vector
 from gdpro_sim.simulation.regions import Region
 
 
 class Pin(Region, Moving):
-    """Parts that are held: where they start, or where keyframes take them."""
+    """Parts that are held: where they start, or where their motion takes them."""
 
     start: float = Field(
         default=0.0, ge=0.0, description="s, when they are taken hold of, where they are by then. MPM"
@@ -21,10 +22,9 @@ class Pin(Region, Moving):
     def _in_time(self) -> Pin:
         if self.release is not None and self.release <= self.start:
             raise ValueError(f"release must be after start ({self.start:g} s), got {self.release:g} s")
-        if self.start > 0.0 and self.motion and self.motion[0].time <= self.start:
-            raise ValueError(
-                f"keyframes must be after start ({self.start:g} s), got {self.motion[0].time:g} s"
-            )
+        keys = () if isinstance(self.motion, Callback) else self.motion
+        if self.start > 0.0 and keys and keys[0].time <= self.start:
+            raise ValueError(f"keyframes must be after start ({self.start:g} s), got {keys[0].time:g} s")
         return self
 
     @model_validator(mode="after")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from gdpro_sim.meshing.tetmesh import Embedding
 from gdpro_sim.simulation.colliders import BoundaryKind, Collider
 from gdpro_sim.simulation.conditions import Hold, Load, Motion, Springs
 from gdpro_sim.simulation.mujoco_model import MujocoWorld
+
+if TYPE_CHECKING:
+    from gdpro_sim.simulation.placement import Placement
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Body:
     vertex_colors:  [V, 3] float32 sRGB of a surface that is not the asset's; None: the asset's
     spacing:        m, between the particles of a fluid, whose surface is made of them in every frame
                     (`gdpro_sim.simulation.mpm.fluid_look`); None: it is carried along
+    placement:      of its asset in the world, where a scene placed it
     """
 
     name: str
@@ -44,6 +48,7 @@ class Body:
     patches: np.ndarray | None = None
     vertex_colors: np.ndarray | None = None
     spacing: float | None = None
+    placement: Placement | None = None
 
 
 @dataclass(frozen=True)
@@ -187,7 +192,7 @@ class Coupling:
     places:     of each of `Model.bodies`: its solver, and its number there
     links:      rigid bodies that move, which the parts do not hold as colliders
     step:       s at most, after which the solvers agree anew
-    iterations: at most, of one step, until they agree
+    iterations: at most, of one step, until they agree; else it is halved
     tolerance:  m/s, by which a rigid body may move otherwise than soft ones were told
     """
 

@@ -6,6 +6,9 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gdpro_sim.errors import MeshError
+from gdpro_sim.meshing.load import parse_color
+
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Number, Number, Number]
 
@@ -21,4 +24,12 @@ def several(value: Any) -> Any:
     return [value] if isinstance(value, dict | Options) else value
 
 
-__all__ = ["Number", "Options", "Vector", "several"]
+def color_of(name: str) -> tuple[float, float, float]:
+    """sRGB in [0, 1] of "#rrggbb" or a CSS name. Raises ValueError."""
+    try:
+        return parse_color(name)
+    except MeshError as error:
+        raise ValueError(str(error)) from None
+
+
+__all__ = ["Number", "Options", "Vector", "color_of", "several"]

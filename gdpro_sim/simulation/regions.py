@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from gdpro_sim.simulation.options import Options, Vector
+from gdpro_sim.simulation.options import Options, Vector, color_of
 
 SLACK = 1e-6
 """How much of the body's extent vertices may lie outside a region: coordinates are rounded."""
@@ -24,7 +24,10 @@ SIDES: dict[str, tuple[int, bool]] = {
 
 
 class Region(Options):
-    """Vertices of a body's tets in world space at the start: give one of box, sphere, side, vertices."""
+    """Part of a body where it stands at the start: give one of box, sphere, side, group, painted, vertices.
+
+    For copies it is written where their body stands without them, and means the same part of each.
+    """
 
     minimum: Vector | None = Field(default=None, description="lower corner of a box, m; default: no limit")
     maximum: Vector | None = Field(default=None, description="upper corner of a box, m; default: no limit")
@@ -40,6 +43,29 @@ class Region(Options):
         default=None, min_length=1, description="ids of the body's tet vertices, from 0"
     )
 
+    group: str | None = Field(
+        default=None, min_length=1, description="name of a vertex group of the asset, `gdpro info` lists them"
+    )
+    painted: str | None = Field(
+        default=None, description="colour of the asset's vertices, #rrggbb or a CSS name, which is chosen"
+    )
+    tolerance: float | None = Field(
+        default=None, gt=0.0, le=1.0,
+        description="how far red, green and blue may be off a painted colour, of 1; default 0.15",
+    )  # fmt: skip
+    depth: float | None = Field(
+        default=None, gt=0.0,
+        description="m, how far below the surface a group or a painted part reaches; default: the outermost "
+        "vertices or particles",
+    )  # fmt: skip
+
+    @field_validator("painted")
+    @classmethod
+    def _a_color(cls, value: str | None) -> str | None:
+        if value is not None:
+            color_of(value)
+        return value
+
     @field_validator("maximum")
     @classmethod
     def _ordered(cls, value: Any, info: Any) -> Any:
@@ -54,8 +80,15 @@ class Region(Options):
             raise ValueError("a sphere needs both `center` and `radius`")
         if self.fraction is not None and self.side is None:
             raise ValueError("`fraction` belongs to a `side`")
+        if self.tolerance is not None and self.painted is None:
+            raise ValueError("`tolerance` belongs to a `painted` colour")
+        if self.depth is not None and self.painted is None and self.group is None:
+            raise ValueError("`depth` belongs to a `group` or a `painted` colour")
         if len(self._kinds()) > 1:
-            raise ValueError(f"give one of box, sphere, side and vertices, got {' and '.join(self._kinds())}")
+            raise ValueError(
+                "give one of box, sphere, side, group, painted and vertices, got "
+                f"{' and '.join(self._kinds())}"
+            )
         return self
 
     def _kinds(self) -> list[str]:
@@ -63,6 +96,8 @@ class Region(Options):
             "a box": self.minimum is not None or self.maximum is not None,
             "a sphere": self.center is not None,
             "a side": self.side is not None,
+            "a group": self.group is not None,
+            "a painted colour": self.painted is not None,
             "vertices": self.vertices is not None,
         }
         return [kind for kind, present in given.items() if present]
@@ -78,12 +113,16 @@ class Region(Options):
             return f"{self.side} side"
         if self.center is not None:
             return f"sphere of {self.radius:g} m at {list(self.center)}"
+        if self.group is not None:
+            return f"group {self.group!r}"
+        if self.painted is not None:
+            return f"part painted {self.painted}"
         if self.vertices is not None:
             return "list of vertices"
         return "box" if self.chosen else "whole body"
 
     def select(self, points: np.ndarray) -> np.ndarray:
-        """[n] bool: which of `points` [n, 3] m lie inside.
+        """[n] bool: which of `points` [n, 3] m lie inside a region that is neither a group nor painted.
 
         Raises IndexError with the id where an explicit vertex is none of them.
         """

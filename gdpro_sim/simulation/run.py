@@ -11,7 +11,9 @@ import torch
 
 from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device
+from gdpro_sim.simulation.callbacks import with_code
 from gdpro_sim.simulation.compile import compile_scene, load_assets
+from gdpro_sim.simulation.conditions import Motion, pose_at
 from gdpro_sim.simulation.frame import BodyFrame, Frame
 from gdpro_sim.simulation.model import Diagnostics, Model, Solver
 from gdpro_sim.simulation.scene import Scene, load_scene
@@ -30,6 +32,7 @@ class Simulation:
         self.model: Model = compile_scene(scene, assets, device=self.device)
         self.solver = solver_of(self.model)
         self.milliseconds: dict[str, float] = {"solve": 0.0, "resplat": 0.0}
+        self._time = 0.0
 
     def __len__(self) -> int:
         return self.scene.frame_count
@@ -45,6 +48,7 @@ class Simulation:
         begin = time.perf_counter()
         if index > 0:
             self.solver.step(1.0 / self.scene.fps)
+        self._time = index / self.scene.fps
         self.milliseconds["solve"] = 1e3 * (time.perf_counter() - begin)
 
     def surfaces(self) -> list[np.ndarray]:
@@ -52,9 +56,14 @@ class Simulation:
         return [self.solver.surface_positions(i) for i in range(len(self.model.bodies))]
 
     def colliders(self) -> np.ndarray | None:
-        """Where colliders are that move freely, see `Frame.colliders`."""
+        """Where colliders are that move freely or by a function, see `Frame.colliders`."""
         if self.model.particles is None or all(item.mass is None for item in self.model.colliders):
-            return None
+            motions = [item.motion for item in self.model.colliders]
+            if not any(isinstance(motion, Motion) and motion.function for motion in motions):
+                return None
+            still = np.eye(3), np.zeros(3)
+            placed = [still if motion is None else pose_at(motion, self._time) for motion in motions]
+            return np.stack([np.column_stack(pose) for pose in placed])
         from gdpro_sim.simulation.mpm import SolverMPM
         from gdpro_sim.simulation.mpm.boundaries import collider_poses
 
@@ -80,11 +89,16 @@ class Simulation:
 
 
 def solver_of(model: Model) -> Solver:
-    """The solver of a model: MPM where it has particles, MuJoCo where it has its bodies, else FEM.
+    """The solver of a model: MPM where it has particles, MuJoCo where it has its bodies, all of them where it
+    is coupled, else FEM.
 
     Raises SceneError or SolverError.
     """
     # Solvers are imported here: they compile kernels, which loading a scene should not.
+    if model.coupling is not None:
+        from gdpro_sim.simulation.coupled import SolverCoupled
+
+        return SolverCoupled(model)
     if model.particles is not None:
         from gdpro_sim.simulation.mpm import SolverMPM
 
@@ -102,17 +116,23 @@ def simulate(
     scene: Scene | str | Path,
     *,
     device: str = "auto",
+    allow_code: bool = False,
     on_progress: Callable[[str], None] | None = None,
 ) -> Simulation:
     """Load and compile a scene; iterate the result to run it.
 
-    scene: a `Scene`, a YAML path, or the name of a shipped scene.
+    scene:      a `Scene`, a YAML path, or the name of a shipped scene.
+    allow_code: run the Python files that the scene names (`motion: {callback: …}`)
+
+    Between frames the loop may look at everything, stop, and set what the scene's own Python functions read:
+    a step asks them for times within it.
     Raises SceneError, MeshError, AssetError or DeviceError; iterating may raise SolverError.
 
         for frame in gdpro_sim.simulate("jelly_bunny"):
             print(frame.time, frame.bodies[0].gaussians.means.mean(0))
     """
     checked = scene if isinstance(scene, Scene) else load_scene(scene)
+    checked = with_code(checked, allow_code)
     return Simulation(checked, load_assets(checked, on_progress=on_progress), device=device)
 
 

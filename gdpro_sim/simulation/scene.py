@@ -8,24 +8,31 @@ import importlib.util
 import logging
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic_core.core_schema import ValidationInfo
 
 from gdpro_sim.errors import SceneError
+from gdpro_sim.simulation.callbacks import callbacks_of
 from gdpro_sim.simulation.colliders import BoundaryKind, ColliderOptions, MeshCollider
+from gdpro_sim.simulation.copies import expand, members
 from gdpro_sim.simulation.forces import AirFlow, Attachment, Spring
+from gdpro_sim.simulation.lights import LIGHTS, LightOptions, expand_lights
 from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.options import Options, Vector, several
+from gdpro_sim.simulation.randomize import Variation, parse
 from gdpro_sim.simulation.scene_body import SceneBody
-from gdpro_sim.simulation.solver_options import FemOptions, SolverOptions
-from gdpro_sim.simulation.view import Camera, Render
+from gdpro_sim.simulation.solver_options import CoupledOptions, FemOptions, SolverOptions
+from gdpro_sim.simulation.view import Camera, NamedCamera, Render, check_cameras
 
 if TYPE_CHECKING:
     from gdpro_sim.asset import Asset
 
 log = logging.getLogger(__name__)
+
+Described = TypeVar("Described", bound=BaseModel)
 
 STIFFEST = 1.0e7
 """Young's modulus in Pa to which `drop_scene` limits materials."""
@@ -46,16 +53,23 @@ class Scene(Options):
 
     name: str = Field(default="scene", min_length=1)
     description: str = ""
-    bodies: tuple[SceneBody, ...] = Field(min_length=1)
+    seed: int = Field(default=0, ge=0, description="of every random draw")
+    bodies: tuple[SceneBody, ...] = Field(
+        min_length=1, description="one or several; of one with `copies` all of them"
+    )
     ground: GroundPlane | None = Field(default_factory=GroundPlane, description="null for no floor")
     gravity: Vector = Field(default=(0.0, 0.0, -9.81), description="m/s^2")
     fps: int = Field(default=30, ge=1, le=1000, description="frames per second")
     duration: float = Field(default=3.0, gt=0.0, le=3600.0, description="s")
-    seed: int = Field(default=0, ge=0)
     camera: Camera = Field(default_factory=Camera)
+    cameras: tuple[NamedCamera, ...] = Field(default=(), description="more cameras; one or several")
+    lights: tuple[LightOptions, ...] = Field(
+        default=(), description=f"one or several, or names of sets: {', '.join(LIGHTS)}; default: studio"
+    )
     render: Render = Field(default_factory=Render)
     solver: SolverOptions = Field(
-        default_factory=FemOptions, description="FEM, `kind: mpm` or `kind: mujoco`"
+        default_factory=FemOptions,
+        description="FEM, `kind: mpm`, `kind: mujoco`, or `kind: coupled`: each body by its own",
     )
     colliders: tuple[ColliderOptions, ...] = Field(
         default=(), description="rigid obstacles, at rest or moving; one or several"
@@ -65,23 +79,47 @@ class Scene(Options):
     attachments: tuple[Attachment, ...] = Field(
         default=(), description="bodies tied together where they meet"
     )
+    randomize: tuple[Variation, ...] = Field(
+        default=(), description="what `gdpro rollout` draws anew for every rollout: paths and their ranges"
+    )
     folder: Path = Field(
         default_factory=Path.cwd, exclude=True, description="where relative paths start; set by load_scene"
     )
 
-    @model_validator(mode="after")
-    def _unique_names(self) -> Scene:
-        seen: set[str] = set()
-        for body in self.bodies:
-            if body.name in seen:
-                raise ValueError(f"two bodies are named {body.name!r}; give each a `name` of its own")
-            seen.add(body.name)
-        return self
+    @field_validator("bodies", mode="before")
+    @classmethod
+    def _some_bodies(cls, value: Any) -> Any:
+        return several(value)
+
+    @field_validator("bodies")
+    @classmethod
+    def _with_copies(cls, value: tuple[SceneBody, ...], info: ValidationInfo) -> tuple[SceneBody, ...]:
+        return expand(value, info.data.get("seed", 0))
 
     @field_validator("colliders", "wind", "springs", "attachments", mode="before")
     @classmethod
     def _several(cls, value: Any) -> Any:
         return () if value is None else several(value)
+
+    @field_validator("cameras", mode="before")
+    @classmethod
+    def _some_cameras(cls, value: Any) -> Any:
+        return () if value is None else several(value)
+
+    @field_validator("lights", mode="before")
+    @classmethod
+    def _sets_of_lights(cls, value: Any) -> Any:
+        return () if value is None else expand_lights(value)
+
+    @model_validator(mode="after")
+    def _cameras_fit(self) -> Scene:
+        check_cameras(self.camera, self.cameras, [body.name for body in self.bodies], self.duration)
+        return self
+
+    @field_validator("randomize", mode="before")
+    @classmethod
+    def _variations(cls, value: Any) -> Any:
+        return parse(value)
 
     @field_validator("solver", mode="before")
     @classmethod
@@ -97,7 +135,7 @@ class Scene(Options):
               for k, ties in enumerate(self.attachments) for name in ties.bodies),
             *((f"wind[{k}].bodies", name) for k, air in enumerate(self.wind) for name in air.bodies or ()),
         ]  # fmt: skip
-        names = [body.name for body in self.bodies]
+        names = list(members(self.bodies))
         for place, name in used:
             if name is not None and name not in names:
                 near = difflib.get_close_matches(name, names, n=1)
@@ -107,11 +145,20 @@ class Scene(Options):
 
     @model_validator(mode="after")
     def _pushed_in_time(self) -> Scene:
+        kind, coupled = self.solver.kind, isinstance(self.solver, CoupledOptions)
         for body in self.bodies:
-            if body.mujoco is not None and not isinstance(self.solver, MujocoOptions):
+            where = f"bodies[{body.name}]"
+            if not coupled and body.solver not in ("auto", kind):
                 raise ValueError(
-                    f"bodies[{body.name}].mujoco: belongs to `solver: {{kind: mujoco}}`, but the solver is "
-                    f"{self.solver.kind}"
+                    f"{where}.solver: {body.solver!r} in a scene whose solver is {kind}; for a solver each, "
+                    "write `solver: {kind: coupled}` in the scene"
+                )
+            if body.mujoco is not None and (
+                body.solver in ("fem", "mpm") if coupled else self.mujoco_options is None
+            ):
+                raise ValueError(
+                    f"{where}.mujoco: belongs to `solver: {{kind: mujoco}}`, but the "
+                    f"{'body' if coupled else 'scene'}'s solver is {body.solver if coupled else kind}"
                 )
         if isinstance(self.solver, FemOptions) and self.solver.integrator == "quasi-static":
             for body in self.bodies:
@@ -128,13 +175,20 @@ class Scene(Options):
         return max(1, round(self.duration * self.fps)) + 1
 
     @property
+    def mujoco_options(self) -> MujocoOptions | None:
+        """Settings of MuJoCo, where it takes part."""
+        solver = self.solver.mujoco if isinstance(self.solver, CoupledOptions) else self.solver
+        return solver if isinstance(solver, MujocoOptions) else None
+
+    @property
     def files(self) -> list[str]:
         """References to every file the scene reads, as they are written in it."""
         named = [reference for body in self.bodies for reference in (body.asset, body.texture)]
         named += [collider.file for collider in self.colliders if isinstance(collider, MeshCollider)]
-        if isinstance(self.solver, MujocoOptions):
-            named.append(self.solver.base)
-        return [reference for reference in named if reference]
+        if self.mujoco_options is not None:
+            named.append(self.mujoco_options.base)
+        named += [callback.file for callback in callbacks_of(self)]
+        return [reference for reference in dict.fromkeys(named) if reference]
 
     def resolve(self, reference: str) -> Path:
         """Absolute path of an asset reference. Raises SceneError for an unknown `package:`."""
@@ -253,7 +307,8 @@ class _UniqueKeys(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _parse(text: str, source: str, folder: Path) -> Scene:
+def read_mapping(text: str, source: str, what: str) -> dict[str, Any]:
+    """The mapping that YAML `text` holds. Raises SceneError naming `source` and the line."""
     try:
         data = yaml.load(text, Loader=_UniqueKeys)
     except yaml.YAMLError as error:
@@ -263,7 +318,12 @@ def _parse(text: str, source: str, folder: Path) -> Scene:
             f"{source}: not valid YAML at {where}: {getattr(error, 'problem', None) or error}"
         ) from None
     if not isinstance(data, dict):
-        raise SceneError(f"{source}: a scene is a mapping with at least `bodies:`, got {type(data).__name__}")
+        raise SceneError(f"{source}: {what}, got {type(data).__name__}")
+    return data
+
+
+def _parse(text: str, source: str, folder: Path) -> Scene:
+    data = read_mapping(text, source, "a scene is a mapping with at least `bodies:`")
     if "folder" in data:
         raise SceneError(f"{source}: unknown key `folder`; asset paths are relative to the scene file")
     return check_scene({"name": Path(source).stem, **data, "folder": folder}, source)
@@ -271,8 +331,13 @@ def _parse(text: str, source: str, folder: Path) -> Scene:
 
 def check_scene(data: dict[str, Any], source: str = "scene") -> Scene:
     """Build a Scene from plain data; SceneError with one line per wrong value."""
+    return checked(Scene, data, source)
+
+
+def checked(kind: type[Described], data: dict[str, Any], source: str) -> Described:
+    """A description of `kind` from plain data; SceneError with one line per wrong value."""
     try:
-        return Scene.model_validate(data)
+        return kind.model_validate(data)
     except ValidationError as error:
         items = error.errors()
         # A list whose only item is wrong is reported as too short as well: say the cause alone.
@@ -282,17 +347,17 @@ def check_scene(data: dict[str, Any], source: str = "scene") -> Scene:
             if a["type"] != "too_short"
             or not any(len(b["loc"]) > len(a["loc"]) and b["loc"][: len(a["loc"])] == a["loc"] for b in items)
         ]
-        lines = [_explain(item, source) for item in items]
+        lines = [_explain(item, source, kind) for item in items]
         raise SceneError("\n".join(dict.fromkeys(lines))) from None
 
 
-def _explain(item: Any, source: str) -> str:
+def _explain(item: Any, source: str, root: type[BaseModel]) -> str:
     """One line for one pydantic error: file, path of the key, what was expected, what was given."""
     location = item["loc"]
-    place, _ = _place(location)
+    place, _ = _place(location, root)
     value = item.get("input")
     if item["type"] == "extra_forbidden":
-        _, allowed = _place(location[:-1])
+        _, allowed = _place(location[:-1], root)
         near = difflib.get_close_matches(str(location[-1]), allowed, n=1)
         hint = f" (did you mean `{near[0]}`?)" if near else ""
         return f"{source}: {place}: unknown key{hint}; allowed: {', '.join(allowed)}"
@@ -313,16 +378,19 @@ def _explain(item: Any, source: str) -> str:
     return f"{source}: {place}{': ' if place else ''}{message}{shown}"
 
 
-def _place(location: tuple[Any, ...]) -> tuple[str, list[str]]:
-    """A path inside Scene as the user writes it, and the field names of the model that lives there.
+def _place(location: tuple[Any, ...], root: type[BaseModel]) -> tuple[str, list[str]]:
+    """A path inside `root` as the user writes it, and the field names of the model that lives there.
 
     The path of pydantic also names which of several kinds of thing was meant; the user wrote no such key.
     """
-    models: list[type[BaseModel]] = [Scene]
+    models: list[type[BaseModel]] = [root]
     place = ""
     for part in location:
         if isinstance(part, int):
             place += f"[{part}]"
+            continue
+        if part.startswith("<"):  # the tag of a union, as in `Moving.motion`
+            models = [model for model in models if model.__name__ == part.strip("<>")]
             continue
         kinds = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == part]
         if kinds and len(models) > 1:
@@ -332,7 +400,7 @@ def _place(location: tuple[Any, ...]) -> tuple[str, list[str]]:
         owners = [model for model in models if part in model.model_fields]
         found = _models_in(owners[0].model_fields[part].annotation) if owners else []
         models = found or models
-    return place, [name for name in models[0].model_fields if name != "folder"]
+    return place, [name for name in models[0].model_fields if name not in ("folder", "copied")]
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
@@ -345,7 +413,9 @@ __all__ = [
     "GroundPlane",
     "Scene",
     "check_scene",
+    "checked",
     "drop_scene",
     "load_scene",
+    "read_mapping",
     "scene_names",
 ]

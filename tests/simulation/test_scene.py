@@ -92,7 +92,7 @@ def test_defaults_and_relative_paths(tmp_path: Path) -> None:
         (MINIMAL + "    pins: {sid: top}", r"pins\[0\].sid: unknown key \(did you mean `side`\?\)"),
         (
             MINIMAL + "    pins: {side: top, radius: 1, center: [0, 0, 0]}",
-            "give one of box, sphere, side and v",
+            "give one of box, sphere, side, group, painted and v",
         ),
         (MINIMAL + "    pins: {radius: 1}", "a sphere needs both `center` and `radius`"),
         (MINIMAL + "    pins: {fraction: 0.1, vertices: [1]}", "`fraction` belongs to a `side`"),
