@@ -2,12 +2,12 @@
 
 from gdpro_sim.asset.asset import Asset
 from gdpro_sim.asset.compose import ComposedPart, compose
-from gdpro_sim.asset.importer import import_mesh, tetrahedralize_asset, versions
+from gdpro_sim.asset.importer import bind_asset, import_mesh, tetrahedralize_asset, versions
 from gdpro_sim.asset.stage import is_asset, kind
 
 __all__ = [
     "Asset",
-    "ComposedPart",
+    "ComposedPart", "bind_asset",
     "compose",
     "import_mesh",
     "is_asset",

@@ -143,7 +143,7 @@ class Asset:
             result["tet_vertices"] = len(self.tets.vertices)
             result["tet_method"] = self.tets.method
             result["volume"] = volume
-            if self.material is not None:
+            if self.material is not None and not self.group_materials:
                 result["mass"] = volume * self.material.density
         if self.pieces is not None:
             result["convex_pieces"] = len(self.pieces)

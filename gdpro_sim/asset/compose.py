@@ -71,9 +71,9 @@ def compose(
     target_tets: of the union, as in `gdpro_sim.meshing.tetrahedralize.tetrahedralize`; 0 makes none
 
     Spherical harmonics turn with their part, and lower degrees are filled up with zeros. Each part becomes a
-    vertex group of its name; what it is made of goes with the group where it is not the first part's
-    material. Names that clash get a number. The provenance lists the parts with their SHA-256, licence and
-    own provenance. One part left as it is gives the same mesh, Gaussians and tets back.
+    vertex group of its name; what it is made of goes with the group where it is not what the first part is
+    made of. Names that clash get a number. The provenance lists the parts with their SHA-256, licence and own
+    provenance. One part left as it is gives the same mesh, Gaussians and tets back.
 
     >>> body, head = Asset.load("body.usdc"), Asset.load("head.usdc")  # doctest: +SKIP
     >>> compose([body, ComposedPart(head, position=(0, 0, 0.3), size=0.2)])  # doctest: +SKIP
@@ -90,7 +90,7 @@ def compose(
     ends = np.cumsum(counts)
     groups: dict[str, np.ndarray] = {}
     materials: dict[str, Material] = {}
-    main = next((asset.material for asset in placed if asset.material is not None), None)
+    main = placed[0].material
     for label, asset, end, count in zip(names, placed, ends, counts, strict=True):
         first = int(end) - count
         if len(placed) > 1:

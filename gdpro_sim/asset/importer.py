@@ -19,6 +19,7 @@ from gdpro_sim.errors import AssetError, MeshError
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.embedding import embed_surface
 from gdpro_sim.meshing.load import USD_SUFFIXES, load_mesh
+from gdpro_sim.meshing.surface import SurfaceMesh
 from gdpro_sim.meshing.tetrahedralize import tetrahedralize
 
 log = logging.getLogger(__name__)
@@ -62,7 +63,6 @@ def import_mesh(
     already is one of our own files.
     """
     path = Path(path)
-    tell: Phase = on_progress or (lambda phase: None)
     if path.suffix.lower() in USD_SUFFIXES and path.is_file():
         found = kind(path)
         if found in ("asset", "simulation"):
@@ -70,28 +70,65 @@ def import_mesh(
                 "use it as it is, without importing" if found == "asset" else "import the mesh it was made of"
             )
             raise AssetError(f"{path} is already a gdpro {found}; {way}")
-    tell("reading the mesh")
+    if on_progress is not None:
+        on_progress("reading the mesh")
     mesh = load_mesh(path, texture=texture, color=color, up=up, scale=scale)
+    options = {
+        "color": color,
+        "texture": None if texture is None else Path(texture).name,
+        "up": up,
+        "scale": scale,
+    }
+    return bind_asset(
+        mesh,
+        name=name if name is not None else path.stem,
+        source=path,
+        options=options,
+        budget=budget,
+        material=material,
+        tets=tets,
+        target_tets=target_tets,
+        edge_length=edge_length,
+        tet_method=tet_method,
+        seed=seed,
+        on_progress=on_progress,
+    )
+
+
+def bind_asset(
+    mesh: SurfaceMesh,
+    *,
+    name: str,
+    source: Path,
+    options: dict[str, Any],
+    budget: int = 50_000,
+    material: Material | None = None,
+    tets: bool = True,
+    target_tets: int = 6_000,
+    edge_length: float | None = None,
+    tet_method: str = "auto",
+    seed: int = 0,
+    on_progress: Phase | None = None,
+) -> Asset:
+    """Make an asset of a mesh that was read from `source`; options as in `import_mesh`.
+
+    options: JSON values for the provenance, which say how the mesh was read
+    """
+    tell: Phase = on_progress or (lambda phase: None)
     for message in mesh.messages:
-        log.warning("%s: %s", path.name, message)
+        log.warning("%s: %s", source.name, message)
     tell("binding Gaussians")
     bound = bind_mesh(mesh, budget=budget, seed=seed)
     provenance: dict[str, Any] = {
-        "source": path.name,
+        "source": source.name,
         "sha256": mesh.sha256,
         "seed": seed,
-        "options": {
-            "budget": budget,
-            "color": color,
-            "texture": None if texture is None else Path(texture).name,
-            "up": up,
-            "scale": scale,
-        },
+        "options": {"budget": budget, **options},
         "messages": list(mesh.messages),
         "versions": versions(),
     }
     asset = Asset(
-        name=name if name is not None else path.stem,
+        name=name,
         gaussians=bound,
         vertex_colors=vertex_colors(mesh, bound),
         material=material,
@@ -106,7 +143,7 @@ def import_mesh(
             method=tet_method,
             on_progress=on_progress,
         )
-    log.info("imported %s: %d Gaussians on %d faces", path.name, len(bound), len(bound.faces))
+    log.info("imported %s: %d Gaussians on %d faces", source.name, len(bound), len(bound.faces))
     return asset
 
 
@@ -157,4 +194,4 @@ def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str]:
     return found
 
 
-__all__ = ["import_mesh", "tetrahedralize_asset", "versions"]
+__all__ = ["bind_asset", "import_mesh", "tetrahedralize_asset", "versions"]

@@ -11,7 +11,7 @@ import typer
 from typer.exceptions import TyperException
 
 import gdpro_sim
-from gdpro_sim.cli import experiments, files, generation, mjcf, verify  # noqa: F401  (they declare their commands)
+from gdpro_sim.cli import compose, experiments, files, generation, mjcf, rollout, verify  # noqa: F401  (they declare their commands)
 from gdpro_sim.cli.common import app
 from gdpro_sim.errors import GdproError
 
@@ -59,6 +59,8 @@ def main() -> None:
         kept = ""
         if "simulate" in sys.argv:
             kept = "; finished frames are kept, the same command continues"
+        elif "rollout" in sys.argv:
+            kept = "; finished rollouts are kept, the same command continues"
         elif "generate" in sys.argv and ("--run" in sys.argv or "--resume" in sys.argv):
             kept = "; the last checkpoint is kept, the same command continues"
         print(f"gdpro: interrupted{kept}", file=sys.stderr)

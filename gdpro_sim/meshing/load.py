@@ -63,25 +63,37 @@ def load_mesh(
     Raises `MeshError` for a missing, unreadable, empty, broken or too large file, naming it and the way out.
     """
     path = Path(path)
-    if up not in ("auto", "y", "z"):
-        raise MeshError(f"up axis must be auto, y or z, got {up!r}")
-    if scale is not None and not (np.isfinite(scale) and scale > 0.0):
-        raise MeshError(f"scale must be > 0, got {scale}")
-    if texture is not None and color is not None:
-        raise MeshError("a texture and a colour cannot both be given; leave one out")
-    rgb = parse_color(color) if color is not None else None
-    image = read_image(Path(texture), str(texture)) if texture is not None else None
     check_file(path)
+    return clean_mesh(read_raw(path), path, texture=texture, color=color, up=up, scale=scale)
+
+
+def read_raw(path: Path) -> RawMesh:
+    """The parts of a mesh file as they stand in it. Raises `MeshError`."""
     if path.suffix.lower() in USD_SUFFIXES:
         from gdpro_sim.meshing.usd_reader import read_usd
 
-        raw = read_usd(path)
-    else:
-        from gdpro_sim.meshing.trimesh_reader import read_trimesh
+        return read_usd(path)
+    from gdpro_sim.meshing.trimesh_reader import read_trimesh
 
-        raw = read_trimesh(path)
-    part = _drop_broken(_merge(raw.parts), path, raw.messages)
-    part.vertices = _upright(part.vertices, raw.up if up == "auto" else up) * (raw.unit * (scale or 1.0))
+    return read_trimesh(path)
+
+
+def clean_mesh(
+    raw: RawMesh,
+    path: Path,
+    *,
+    texture: str | Path | None = None,
+    color: str | None = None,
+    up: str = "auto",
+    scale: float | None = None,
+) -> SurfaceMesh:
+    """What `load_mesh` makes of the parts that a reader found in the file `path`."""
+    rgb = parse_color(color) if color is not None else None
+    if texture is not None and color is not None:
+        raise MeshError("a texture and a colour cannot both be given; leave one out")
+    image = read_image(Path(texture), str(texture)) if texture is not None else None
+    part = _drop_broken(merge_parts(raw.parts), path, raw.messages)
+    part.vertices = upright(part.vertices, raw, up, scale)
     if raw.unit != 1.0:
         raw.messages.append(f"the file's unit is {raw.unit:g} m; lengths were converted to metres")
     _color(part, path, rgb, image, raw)
@@ -145,7 +157,8 @@ def _supported() -> str:
     return ", ".join(s[1:] for s in SUPPORTED)
 
 
-def _merge(parts: list[RawPart]) -> RawPart:
+def merge_parts(parts: list[RawPart]) -> RawPart:
+    """One part of several, their vertices and faces one after the other."""
     if len(parts) == 1:
         return parts[0]
     faces = np.concatenate([p.faces for p in parts])
@@ -196,14 +209,22 @@ def _drop_broken(part: RawPart, path: Path, messages: list[str]) -> RawPart:
     return part
 
 
-def _upright(vertices: np.ndarray, up: str) -> np.ndarray:
-    """Rotate a right-handed frame so that `up` becomes +Z."""
+def upright(vertices: np.ndarray, raw: RawMesh, up: str = "auto", scale: float | None = None) -> np.ndarray:
+    """Vertices [V, 3] of `raw` in metres, turned so that its vertical axis, or `up`, becomes +Z.
+
+    `up` and `scale` as in `load_mesh`. Raises `MeshError` for others.
+    """
+    if up not in ("auto", "y", "z"):
+        raise MeshError(f"up axis must be auto, y or z, got {up!r}")
+    if scale is not None and not (np.isfinite(scale) and scale > 0.0):
+        raise MeshError(f"scale must be > 0, got {scale}")
     x, y, z = vertices.T
-    if up == "y":
-        return np.stack([x, -z, y], 1)
-    if up == "x":
-        return np.stack([-z, y, x], 1)
-    return vertices
+    axis = raw.up if up == "auto" else up
+    if axis == "y":
+        vertices = np.stack([x, -z, y], 1)
+    elif axis == "x":
+        vertices = np.stack([-z, y, x], 1)
+    return vertices * (raw.unit * (scale or 1.0))
 
 
 def _color(
@@ -279,7 +300,7 @@ def _finish(part: RawPart, path: Path, raw: RawMesh) -> SurfaceMesh:
         part.material_ids.astype(np.int32),
         tuple(part.materials),
         str(path),
-        sha256_of(path),
+        sha256_of(path) if path.is_file() else "",
         tuple(messages),
     )
 
@@ -295,4 +316,13 @@ def _size_warning(diagonal: float) -> str:
     )
 
 
-__all__ = ["MAX_FACES", "SUPPORTED", "load_mesh", "parse_color"]
+__all__ = [
+    "MAX_FACES",
+    "SUPPORTED",
+    "clean_mesh",
+    "load_mesh",
+    "merge_parts",
+    "parse_color",
+    "read_raw",
+    "upright",
+]

@@ -75,7 +75,7 @@ def _part(mesh: Any, transform: np.ndarray, kind: str, name: str, messages: list
                 f"mesh {name!r}: {bad} of {len(faces)} faces point at missing vertices; re-export it"
             )
         messages.append(f"mesh {name!r}: dropped {bad} faces that point at missing vertices")
-    uv, colors, ids, materials = _visual(mesh, faces[inside], inside, kind)
+    uv, colors, ids, materials = corner_looks(mesh, faces[inside], inside, kind)
     faces = faces[inside]
     if not np.allclose(transform, np.eye(4), rtol=0.0, atol=0.0):
         vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
@@ -87,7 +87,7 @@ def _part(mesh: Any, transform: np.ndarray, kind: str, name: str, messages: list
     return RawPart(vertices, faces, ids, materials, uv, colors)
 
 
-def _visual(
+def corner_looks(
     mesh: Any, faces: np.ndarray, kept: np.ndarray, kind: str
 ) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray, list[MeshMaterial]]:
     """Per-corner UV and colours, material of each face, materials."""
@@ -199,4 +199,4 @@ def _missing_obj_files(path: Path, messages: list[str]) -> None:
                 )
 
 
-__all__ = ["read_trimesh"]
+__all__ = ["corner_looks", "read_trimesh"]

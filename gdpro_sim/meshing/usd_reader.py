@@ -24,7 +24,12 @@ def read_usd(path: Path) -> RawMesh:
     keep the stage's axes and units; `RawMesh.up` and `.unit` say which. Raises `MeshError` when the stage
     cannot be opened or holds no mesh.
     """
-    from pxr import Tf, Usd, UsdGeom
+    return read_stage(open_stage(path), path)[0]
+
+
+def open_stage(path: Path) -> Any:
+    """A USD stage. Raises `MeshError` when it cannot be opened."""
+    from pxr import Tf, Usd
 
     try:
         stage = Usd.Stage.Open(str(path))
@@ -34,6 +39,13 @@ def read_usd(path: Path) -> RawMesh:
         raise MeshError(f"{path}: cannot be opened as USD ({reason}); check it with usdchecker") from error
     if stage is None:
         raise MeshError(f"{path}: cannot be opened as USD; check it with usdchecker")
+    return stage
+
+
+def read_stage(stage: Any, path: Path) -> tuple[RawMesh, list[Any]]:
+    """As `read_usd`, of an open stage: its parts, and the mesh prim that each is of."""
+    from pxr import Usd, UsdGeom
+
     time = Usd.TimeCode.EarliestTime()
     raw = RawMesh(
         up=str(UsdGeom.GetStageUpAxis(stage)).lower(), unit=float(UsdGeom.GetStageMetersPerUnit(stage) or 1.0)
@@ -41,6 +53,7 @@ def read_usd(path: Path) -> RawMesh:
     xforms = UsdGeom.XformCache(time)
     skipped = {"invisible": 0, "guide or proxy": 0}
     other: set[str] = set()
+    prims = []
     faces = 0
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         if not prim.IsA(UsdGeom.Mesh):
@@ -61,6 +74,7 @@ def read_usd(path: Path) -> RawMesh:
             if faces > MAX_FACES:
                 raise too_many_faces(path, faces)
             raw.parts.append(part)
+            prims.append(prim)
     for reason, count in skipped.items():
         if count:
             raw.messages.append(f"skipped {count} {reason} mesh prim(s)")
@@ -69,7 +83,7 @@ def read_usd(path: Path) -> RawMesh:
     if not raw.parts:
         found = f"; it has {', '.join(sorted(other))}, convert them to meshes first" if other else ""
         raise MeshError(f"{path}: the stage holds no visible Mesh prim with faces{found}")
-    return raw
+    return raw, prims
 
 
 def _part(mesh: Any, matrix: np.ndarray, time: Any, messages: list[str]) -> RawPart | None:
@@ -315,4 +329,4 @@ def _preview(value: Any) -> tuple[float, float, float, float]:
     return r, g, b, 1.0
 
 
-__all__ = ["read_usd", "triangulate"]
+__all__ = ["open_stage", "read_stage", "read_usd", "triangulate"]
