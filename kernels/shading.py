@@ -50,35 +50,37 @@ def gather_light(
     focal: float,
     directions: wp.array[wp.vec3],
     weights: wp.array[float],
-    key_lights: int,
+    first: wp.array[int],
     bias: float,
     softness: float,
     # Out:
-    light_out: wp.array[wp.vec3],
+    light_out: wp.array2d[float],
+    seen_out: wp.array2d[float],
 ):
-    """Per point: light of the key, light of the sky (both with the cosine), and how visible the key is."""
+    """Per point and group of lights: what arrives of their light (with the cosine), and how visible they are.
+
+    Group g holds the lights from first[g] up to first[g + 1].
+    """
     i = start + wp.tid()
     p = points[i]
     n = normals[i]
-    key = float(0.0)
-    sky = float(0.0)
-    seen = float(0.0)
     middle_u = 0.5 * float(alpha.shape[2])
     middle_v = 0.5 * float(alpha.shape[1])
-    for light in range(directions.shape[0]):
-        is_key = light < key_lights
-        cosine = wp.dot(n, directions[light])
-        if cosine <= 0.0:
-            continue
-        q = wp.transform_point(viewmats[light], p)
-        share = float(1.0)
-        if q[2] > 0.0:
-            u = focal * q[0] / q[2] + middle_u
-            v = focal * q[1] / q[2] + middle_v
-            share = light_reaching(alpha, depth, light, u, v, q[2], bias, softness)
-        if is_key:
-            key += weights[light] * cosine * share
-            seen += share / float(key_lights)
-        else:
-            sky += weights[light] * cosine * share
-    light_out[i] = wp.vec3(key, sky, seen)
+    for group in range(first.shape[0] - 1):
+        arriving = float(0.0)
+        seen = float(0.0)
+        count = float(first[group + 1] - first[group])
+        for light in range(first[group], first[group + 1]):
+            cosine = wp.dot(n, directions[light])
+            if cosine <= 0.0:
+                continue
+            q = wp.transform_point(viewmats[light], p)
+            share = float(1.0)
+            if q[2] > 0.0:
+                u = focal * q[0] / q[2] + middle_u
+                v = focal * q[1] / q[2] + middle_v
+                share = light_reaching(alpha, depth, light, u, v, q[2], bias, softness)
+            arriving += weights[light] * cosine * share
+            seen += share / count
+        light_out[i, group] = arriving
+        seen_out[i, group] = seen

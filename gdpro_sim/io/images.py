@@ -14,14 +14,17 @@ from gdpro_sim.files import atomic_write
 
 
 def write_png(path: str | Path, picture: np.ndarray) -> None:
-    """Write one uint8 [H, W, 3] picture. Raises OutputError."""
+    """Write one uint8 picture [H, W, 3], or [H, W, 4] with opacity. Raises OutputError."""
     with atomic_write(path) as temporary:
         Image.fromarray(picture).save(temporary, format="PNG", compress_level=2)
 
 
 def read_png(path: str | Path) -> np.ndarray:
-    """Read one picture as uint8 [H, W, 3]."""
+    """Read one picture as uint8 [H, W, 3]; one that is not opaque is laid on white."""
     with Image.open(path) as image:
+        if image.mode == "RGBA":
+            white = Image.new("RGBA", image.size, "white")
+            return np.asarray(Image.alpha_composite(white, image).convert("RGB"))
         return np.asarray(image.convert("RGB"))
 
 

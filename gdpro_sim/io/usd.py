@@ -6,6 +6,7 @@
             Splats         ParticleField3DGaussianSplat: positions, orientations, scales, extent per frame
             Points         the same Gaussians for programs that drop splats (Blender)
             Tets           rest tetrahedra, with PhysicsMaterial
+        Cameras, Lights    how the scene is seen, see `gdpro_sim.io.usd_views`
 
 Positions are the solver's float32 values in world space. Colours, opacities, topology and the binding are
 written once.
@@ -30,6 +31,8 @@ from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.errors import AssetError, OutputError, RequestError
 from gdpro_sim.files import check_writable, commit_file, output_error, remove_quietly, temporary_beside
 from gdpro_sim.gaussians import Gaussians, sh_to_rgb
+from gdpro_sim.io.staging import Shot
+from gdpro_sim.io.usd_views import ViewPrims
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.frame import BodyFrame, Frame
@@ -129,6 +132,7 @@ class SimulationWriter:
         self._fps = float(fps)
         self._metadata = json.dumps(metadata or {}, allow_nan=False)
         self._prims: list[tuple[Usd.Prim, SplatPrims]] = []
+        self._views: ViewPrims | None = None
         self._faces = [prims.to_numpy(body.gaussians.faces) for body in bodies]
         self._welded = [body.gaussians.to("cpu").welded for body in bodies]
         self._first = self._last = 0
@@ -142,8 +146,8 @@ class SimulationWriter:
 
     # ---- frames ----
 
-    def add(self, frame: Frame) -> None:
-        """Append one frame; indices must increase.
+    def add(self, frame: Frame, shot: Shot | None = None) -> None:
+        """Append one frame; indices must increase. shot: how it is seen, of every frame or of none.
 
         Raises ValueError for a frame that does not fit the bodies, OutputError where writing fails (the
         temporary file is then gone and the writer closed).
@@ -158,9 +162,14 @@ class SimulationWriter:
         with self._guard():
             if self.frames == 0:
                 self._define(frame, samples)
+                if shot is not None:
+                    root = self._stage.GetDefaultPrim().GetPath()
+                    self._views = ViewPrims(self._stage, root, shot.cameras, shot.lights)
                 self._first = frame.index
             with Sdf.ChangeBlock():
                 self._sample(frame, samples)
+                if self._views is not None and shot is not None:
+                    self._views.set(shot.cameras, shot.lights, float(frame.index))
             self.frames += 1
             self._last = frame.index
             self._pending += sum(48 * len(b.gaussians) + 24 * len(b.vertices) for b in frame.bodies)
@@ -324,6 +333,7 @@ class SimulationWriter:
     def _release(self) -> None:
         self._open = False
         self._prims = []
+        self._views = None
         del self._stage, self._layer
 
     def _guard(self) -> _Guard:
@@ -347,6 +357,7 @@ class _Guard:
         writer = self._writer
         writer._open = False
         writer._prims = []
+        writer._views = None
         writer.__dict__.pop("_stage", None)
         writer.__dict__.pop("_layer", None)
         remove_quietly(writer._temporary)
@@ -360,7 +371,7 @@ def _identifier(name: str, taken: set[str]) -> str:
     """A prim name for `name` that is not in `taken`, which it joins."""
     base = Tf.MakeValidIdentifier(name) or "Body"
     chosen, number = base, 1
-    while chosen in taken or chosen == "PhysicsScene":
+    while chosen in taken or chosen in ("PhysicsScene", "Cameras", "Lights"):
         number += 1
         chosen = f"{base}_{number}"
     taken.add(chosen)

@@ -75,9 +75,9 @@ def render_file(
     reader = SimulationReader(path)
     renderer = _recorded(reader, camera or {}, shading, background)
     obstacles = _obstacles(reader, name)
-    facing = Facing([body.gaussians.to(name) for body in reader.bodies], renderer.cameras[0])
+    facing = Facing([body.gaussians.to(name) for body in reader.bodies])
     for frame in reader:
-        normals = facing.normals([body.vertices for body in frame.bodies])
+        normals = facing.normals([body.vertices for body in frame.bodies], renderer.cameras[0])
         shown = obstacles.added_to(frame.gaussians().to(name), normals, frame.time, frame.colliders)
         write(renderer.render(*shown), len(reader))
     remove_frames_from(folder, len(reader))
