@@ -80,7 +80,11 @@ def compile_coupled(
                 places[k] = (part, number)
             parts[part] = compile_part(_sub_scene(scene, options, part, chosen), assets)
     _warn_apart(named)
+    from gdpro_sim.simulation.coupled.base import base_links  # brings MuJoCo
+
     links, still = rigid_links(parts["mujoco"])
+    more, stands = base_links(parts["mujoco"])
+    links, still = (*links, *more), (*still, *stands)
     for part in ("fem", "mpm"):
         if part in parts:
             parts[part] = replace(parts[part], colliders=(*parts[part].colliders, *still))
