@@ -234,15 +234,18 @@ def _run(
 # ---- primitives ----
 
 
-def fit_primitive(kind: PrimitiveKind, solid: MassProperties) -> Primitive:
+SAME = 0.01
+"""Moments that differ by less than this share are taken as equal: their axes could be any."""
+
+
+def fit_primitive(kind: PrimitiveKind, solid: MassProperties, frame: np.ndarray | None = None) -> Primitive:
     """The primitive with a solid's volume, centre, principal axes and, as far as its kind can, inertia.
 
     A box takes the ratios of all three moments; capsule and cylinder lie along the axis whose moment differs
-    most from the other two and take the ratio of it to their mean.
+    most from the other two and take the ratio of it to their mean. Where moments are equal, as a cube's are,
+    the axes are as near to those of `frame` [3, 3] as can be; None: the world's.
     """
-    moments, axes = np.linalg.eigh(solid.inertia)
-    if np.linalg.det(axes) < 0.0:
-        axes[:, 0] *= -1.0
+    moments, axes = _principal(solid.inertia, np.eye(3) if frame is None else frame)
     volume = solid.volume
     if kind == "sphere":
         return Primitive(kind, ((0.75 * volume / math.pi) ** (1.0 / 3.0),), solid.centre, np.eye(3))
@@ -264,6 +267,24 @@ def fit_primitive(kind: PrimitiveKind, solid: MassProperties) -> Primitive:
         shape = _capsule_shape(ratio)
         radius = (volume / (math.pi * (shape + 4.0 / 3.0))) ** (1.0 / 3.0)
     return Primitive(kind, (radius, 0.5 * shape * radius), solid.centre, turned)
+
+
+def _principal(inertia: np.ndarray, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Moments [3], ascending, and their axes [3, 3], right-handed, in columns."""
+    moments, axes = np.linalg.eigh(inertia)
+    near = np.diff(moments) < SAME * moments[2]
+    if near.all():
+        axes = frame.copy()
+    elif near.any():
+        alone = axes[:, 2 if near[0] else 0]
+        first = frame[:, np.argmin(np.abs(frame.T @ alone))]
+        first = first - (first @ alone) * alone
+        first /= np.linalg.norm(first)
+        pair = [first, np.cross(alone, first)]
+        axes = np.column_stack([*pair, alone] if near[0] else [alone, *pair])
+    if np.linalg.det(axes) < 0.0:
+        axes[:, 0] *= -1.0
+    return moments, axes
 
 
 def _capsule_shape(ratio: float) -> float:

@@ -21,8 +21,9 @@ from gdpro_sim.meshing.convex import (
     tet_mass_properties,
 )
 from gdpro_sim.meshing.repair import validate
-from gdpro_sim.simulation.colliders import HeightfieldCollider, compile_collider
+from gdpro_sim.simulation.colliders import PlaneCollider, compile_collider
 from gdpro_sim.simulation.compile_forces import Placed, chosen_pins
+from gdpro_sim.simulation.compile_mujoco_forces import apply_loads
 from gdpro_sim.simulation.conditions import Motion
 from gdpro_sim.simulation.model import Body, Ground, Model, Particles
 from gdpro_sim.simulation.mujoco_model import (
@@ -35,7 +36,7 @@ from gdpro_sim.simulation.mujoco_model import (
     SoftBody,
 )
 from gdpro_sim.simulation.mujoco_options import MujocoBody, MujocoOptions
-from gdpro_sim.simulation.placement import Placement, material_of, place
+from gdpro_sim.simulation.placement import Placement, material_of, place_bodies
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.scene_body import SceneBody
 
@@ -102,12 +103,11 @@ def compile_mujoco(
 
     Raises SceneError for what MuJoCo cannot do, meshes that cannot be weighed, and pins that hold nothing.
     """
-    _check_supported(scene)
+    check_supported(scene)
     made: list[RigidBody | SoftBody] = []
     bodies: list[Body] = []
-    for body in scene.bodies:
+    for body, placement in zip(scene.bodies, place_bodies(scene, assets), strict=True):
         where = f"{scene.name}: body {body.name!r}"
-        placement = place(scene, body, assets[body.name])
         material = material_of(body, placement.asset)
         form = form_of(body, assets[body.name])
         if form == "rigid":
@@ -120,6 +120,7 @@ def compile_mujoco(
                 gaussians=placement.asset.gaussians.to(device),
                 surface=placement.surface,
                 embedding=None if form == "rigid" else placement.asset.embedding,
+                placement=placement,
             )
         )
     soft = any(isinstance(item, SoftBody) for item in made)
@@ -129,6 +130,17 @@ def compile_mujoco(
                 "body %r: beside soft bodies it bounces at about 0.8 of its restitution of %.2g",
                 item.name, item.restitution,
             )  # fmt: skip
+    world = MujocoWorld(
+        tuple(made),
+        options.settings(soft),
+        base=None if options.base is None else scene.resolve(options.base),
+        keyframe=options.keyframe,
+        controls=tuple(
+            Control(name, np.array([key.time for key in keys]), np.array([key.value for key in keys]))
+            for name, keys in options.controls.items()
+        ),
+        callback=options.controller,
+    )
     none = Particles(
         np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32),
         np.zeros(0, np.int32), (), 0.0,
@@ -141,17 +153,34 @@ def compile_mujoco(
         colliders=tuple(compile_collider(item, scene.resolve) for item in scene.colliders),
         device=device,
     )
-    world = MujocoWorld(
-        tuple(made),
-        options.settings(soft),
-        base=None if options.base is None else scene.resolve(options.base),
-        keyframe=options.keyframe,
-        controls=tuple(
-            Control(name, np.array([key.time for key in keys]), np.array([key.value for key in keys]))
-            for name, keys in options.controls.items()
+    return apply_loads(scene, _numbered(replace(model, particles=None, mujoco=world), assets))
+
+
+def _numbered(model: Model, assets: dict[str, Asset]) -> Model:
+    """The model with its bodies' points, the tets of the soft ones, and where each body's begin."""
+    world = model.mujoco
+    assert world is not None
+    firsts = world.firsts()
+    tets, fill, bodies = [np.zeros((0, 4), np.int32)], [np.zeros(0, np.float32)], []
+    begin = 0
+    for body, item, first, end in zip(model.bodies, world.bodies, firsts[:-1], firsts[1:], strict=True):
+        count = 0
+        mesh = assets[body.name].tets
+        if isinstance(item, SoftBody) and mesh is not None:
+            count = len(item.tets)
+            tets.append(item.tets.astype(np.int32) + np.int32(first))
+            fill.append(mesh.fill)
+        bodies.append(replace(body, vertex_range=(first, end), tet_range=(begin, begin + count)))
+        begin += count
+    return replace(
+        model,
+        bodies=tuple(bodies),
+        vertices=np.concatenate([np.zeros((0, 3)), *(item.points for item in world.bodies)]).astype(
+            np.float32
         ),
+        tets=np.concatenate(tets),
+        fill=np.concatenate(fill),
     )
-    return replace(model, particles=None, mujoco=world)
 
 
 # ---- rigid ----
@@ -209,7 +238,7 @@ def _weighed(where: str, placement: Placement) -> MassProperties:
 
 def _shapes(where: str, own: MujocoBody, placement: Placement, solid: MassProperties) -> tuple[Shape, ...]:
     if own.shape in PRIMITIVES:
-        fit = fit_primitive(own.shape, solid)  # type: ignore[arg-type]
+        fit = fit_primitive(own.shape, solid, placement.turn)  # type: ignore[arg-type]
         return (Shape(fit.kind, fit.size, fit.position - solid.centre, fit.rotation),)
     if own.shape == "hull":
         try:
@@ -265,7 +294,7 @@ def _soft(
     vertices = placement(asset.tets.vertices)
     mass = asset.tets.volumes() * asset.tets.fill * material.density
     masses = np.bincount(asset.tets.tets.ravel(), weights=np.repeat(mass / 4.0, 4), minlength=len(vertices))
-    pinned, motions = _pins(scene, body, vertices)
+    pinned, motions = _pins(scene, body, vertices, placement)
     size = np.ptp(vertices, axis=0)
     cells = own.cells or tuple(int(n) for n in np.clip(np.round(CELLS * size / size.max()), 1, CELLS))
     return SoftBody(
@@ -288,20 +317,17 @@ def _soft(
     )
 
 
-def _pins(scene: Scene, body: SceneBody, vertices: np.ndarray) -> tuple[np.ndarray, tuple[Motion, ...]]:
-    item = Placed(scene, body.name, vertices, 0)
+def _pins(
+    scene: Scene, body: SceneBody, vertices: np.ndarray, placement: Placement
+) -> tuple[np.ndarray, tuple[Motion, ...]]:
+    item = Placed(scene, body.name, vertices, 0, placement=placement)
     pinned = np.zeros(len(vertices), bool)
     motions = []
-    for k, (pin, ids) in enumerate(zip(body.pins, chosen_pins(body, item), strict=True)):
-        if pin.release is not None or pin.start > 0.0:
-            raise SceneError(
-                f"{item.where}.pins[{k}]: MuJoCo holds its vertices all the time; leave out `start` and "
-                "`release`, or choose the FEM solver"
-            )
+    for pin, ids in zip(body.pins, chosen_pins(body, item), strict=True):
         fresh = ids[~pinned[ids]]
         pinned[fresh] = True
         if pin.motion and len(fresh):
-            motions.append(pin.compiled(vertices[ids].mean(axis=0), fresh))
+            motions.append(item.motion(pin, ids, fresh))
     return pinned, tuple(motions)
 
 
@@ -317,29 +343,36 @@ def _three(values: np.ndarray) -> tuple[float, float, float]:
 # ---- checks ----
 
 
-def _check_supported(scene: Scene) -> None:
-    """Raise SceneError for what only the other solvers can do."""
-    absent = {
-        "wind": bool(scene.wind),
-        "springs": bool(scene.springs),
-        "attachments": bool(scene.attachments),
-        **{
-            f"bodies[{body.name}].{key}": bool(getattr(body, key))
-            for body in scene.bodies
-            for key in ("pressures", "forces", "impulses", "parts", "particles")
-        },
-    }
-    for key, given in absent.items():
-        if given:
-            raise SceneError(f"{scene.name}: {key}: the MuJoCo solver has none; remove it, or choose another")
+def check_supported(scene: Scene) -> None:
+    """Raise SceneError for what only the other solvers can do, as far as a scene alone says it."""
+    for body in scene.bodies:
+        for key in ("parts", "particles"):
+            if getattr(body, key):
+                raise SceneError(
+                    f"{scene.name}: bodies[{body.name}].{key}: belongs to MPM (`solver: {{kind: mpm}}`)"
+                )
+        for k, pin in enumerate(body.pins):
+            if pin.release is not None or pin.start > 0.0:
+                raise SceneError(
+                    f"{scene.name}: bodies[{body.name}].pins[{k}]: MuJoCo holds its vertices all the time; "
+                    "leave out `start` and `release`, or choose the FEM solver"
+                )
     for k, collider in enumerate(scene.colliders):
         where = f"{scene.name}: colliders[{k}]"
-        if isinstance(collider, HeightfieldCollider):
-            raise SceneError(f"{where}: MuJoCo has no height field here; choose the FEM or MPM solver")
+        if isinstance(collider, PlaneCollider) and collider.motion:
+            raise SceneError(f"{where}.motion: a plane stands still in MuJoCo; give a large box")
         if collider.boundary != "separate" or collider.start or collider.end is not None:
             raise SceneError(f"{where}: `boundary`, `start` and `end` are MPM's; leave them out")
         if collider.mass is not None:
             raise SceneError(f"{where}.mass: is MPM's; in MuJoCo make it a body, which is rigid or soft")
 
 
-__all__ = ["FULL_TETS", "REDUCED_TETS", "RESTITUTION", "compile_mujoco", "form_of", "prepare"]
+__all__ = [
+    "FULL_TETS",
+    "REDUCED_TETS",
+    "RESTITUTION",
+    "check_supported",
+    "compile_mujoco",
+    "form_of",
+    "prepare",
+]

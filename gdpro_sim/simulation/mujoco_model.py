@@ -11,10 +11,14 @@ from typing import Literal
 
 import numpy as np
 
+from gdpro_sim.simulation.callbacks import Callback
 from gdpro_sim.simulation.conditions import Motion
 
 JointKind = Literal["free", "fixed", "hinge", "slide", "ball"]
 Reduction = Literal["full", "trilinear", "quadratic"]
+
+FRAME = 4
+"""Points of a rigid body before its surface: its centre, and along the world's axes at the start."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,20 @@ class RigidBody:
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     angular_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    @property
+    def points(self) -> np.ndarray:
+        """[FRAME + V, 3] m that forces act on: its centre, three points at its size from it, its surface."""
+        size = float(np.linalg.norm(np.ptp(self.surface, axis=0))) or 1.0
+        return np.concatenate([self.centre[None], self.centre + size * np.eye(3), self.surface])
+
+
+@dataclass(frozen=True)
+class Tie:
+    """Vertices [n] int32 of a soft body that the rigid body number `body` carries."""
+
+    vertices: np.ndarray
+    body: int
+
 
 @dataclass(frozen=True)
 class SoftBody:
@@ -80,6 +98,7 @@ class SoftBody:
     cells:    of the grid along X, Y and Z; not of a full flex
     radius:   m, how far out the flex touches
     neo_hookean: stable neo-Hookean elasticity, else Saint Venant-Kirchhoff, which is all a grid of nodes has
+    ties:     to rigid bodies, of a full flex; no vertex is pinned, or in two of them
     """
 
     name: str
@@ -99,6 +118,12 @@ class SoftBody:
     radius: float = 1e-3
     self_contact: bool = False
     neo_hookean: bool = True
+    ties: tuple[Tie, ...] = ()
+
+    @property
+    def points(self) -> np.ndarray:
+        """[P, 3] m that forces act on."""
+        return self.vertices
 
     @property
     def stable(self) -> bool:
@@ -146,6 +171,9 @@ class MujocoWorld:
     base:     an MJCF file whose world the bodies join
     keyframe: of the base, that it starts from; None: its own beginning
     controls: of the base's actuators
+    welds:    pairs of rigid bodies that are held to each other as they stand at the start
+    callback: (time in s, MuJoCo's `MjData`) -> what actuators are told by name, or of all in their order;
+              called before every step of MuJoCo, after the keyframes
     """
 
     bodies: tuple[RigidBody | SoftBody, ...] = ()
@@ -153,9 +181,17 @@ class MujocoWorld:
     base: Path | None = None
     keyframe: str | None = None
     controls: tuple[Control, ...] = ()
+    welds: tuple[tuple[int, int], ...] = ()
+    callback: Callback | None = None
+
+    def firsts(self) -> list[int]:
+        """Where each body's points begin in what springs and loads of the `Model` count, and their number."""
+        counts = [len(body.points) for body in self.bodies]
+        return np.concatenate([[0], np.cumsum(counts)]).astype(int).tolist()
 
 
 __all__ = [
+    "FRAME",
     "Control",
     "Joint",
     "JointKind",
@@ -165,4 +201,5 @@ __all__ = [
     "RigidBody",
     "Shape",
     "SoftBody",
+    "Tie",
 ]

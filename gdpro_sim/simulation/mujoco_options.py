@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from gdpro_sim.simulation.callbacks import Callback, taken
 from gdpro_sim.simulation.mujoco_model import JointKind, MujocoSettings, Reduction
 from gdpro_sim.simulation.options import Number, Options, Vector
 
@@ -51,6 +52,16 @@ class MujocoOptions(Options):
     controls: dict[str, tuple[ControlKey, ...]] = Field(
         default={}, description="of the base's actuators by name: keyframes in order of time"
     )
+    controller: Callback | None = Field(
+        default=None,
+        description="function (time in s, MuJoCo's data) of what the base's actuators are told: a dictionary "
+        "by name, or an array of all, or None; asked before every step, after the keyframes",
+    )
+
+    @field_validator("controller", mode="before")
+    @classmethod
+    def _function(cls, value: Any) -> Any:
+        return taken(value)
 
     @field_validator("controls")
     @classmethod
@@ -67,7 +78,7 @@ class MujocoOptions(Options):
 
     @model_validator(mode="after")
     def _of_a_base(self) -> MujocoOptions:
-        for key in ("keyframe", "controls"):
+        for key in ("keyframe", "controls", "controller"):
             if getattr(self, key) and self.base is None:
                 raise ValueError(f"`{key}` belongs to a `base`, which is not given")
         return self

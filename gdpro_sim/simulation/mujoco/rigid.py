@@ -75,14 +75,26 @@ def add_driven(spec: mujoco.MjSpec, name: str, mass: float, size: float = 1.0) -
     return added
 
 
-def set_mass(added: Any, mass: float, inertia: np.ndarray) -> None:
-    """Mass in kg at the body's origin and inertia [3, 3] kg m^2 along its axes."""
+def set_mass(added: Any, mass: float, inertia: np.ndarray, centre: np.ndarray | None = None) -> None:
+    """Mass in kg at the body's origin, or `centre` [3] m, and inertia [3, 3] kg m^2 about it."""
     added.explicitinertial = True
-    added.mass, added.ipos = mass, [0.0, 0.0, 0.0]
+    added.mass, added.ipos = mass, [0.0, 0.0, 0.0] if centre is None else centre.tolist()
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     if np.linalg.det(axes) < 0.0:
         axes[:, 0] *= -1.0
     added.inertia, added.iquat = moments.tolist(), quaternion(axes)
+
+
+def load_mass(added: Any, body: RigidBody, points: np.ndarray, masses: np.ndarray) -> None:
+    """Weigh the body with point masses [n] kg at [n, 3] m that it carries."""
+    total = body.mass + masses.sum()
+    arms = points - body.centre
+    centre = masses @ arms / total
+    whole = np.concatenate([[-centre], arms - centre])
+    squares = np.concatenate([[body.mass], masses])[:, None, None] * (
+        (whole**2).sum(axis=1)[:, None, None] * np.eye(3) - whole[:, :, None] * whole[:, None, :]
+    )
+    set_mass(added, float(total), body.inertia + squares.sum(axis=0), centre)
 
 
 def add_shapes(
@@ -114,4 +126,4 @@ def add_shapes(
     return geoms
 
 
-__all__ = ["add_driven", "add_rigid", "add_shapes", "quaternion", "set_mass"]
+__all__ = ["add_driven", "add_rigid", "add_shapes", "load_mass", "quaternion", "set_mass"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,19 +32,32 @@ class Points:
 
     positions: [n, 3] m; masses: [n] kg
     names:     of their bodies, empty for what is held, or goes with another
+    owners:    of the bodies that carry them, their own or others
+    local:     [n, 3] m, where they are in their owners' frames
     """
 
     positions: np.ndarray
     masses: np.ndarray
     names: tuple[str, ...]
+    owners: tuple[str, ...]
+    local: np.ndarray
 
 
-def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
-    """The flex, a body for every free vertex or node, and one for every motion of pins. Raises SceneError."""
-    held = np.zeros(len(body.vertices), bool) if body.pinned is None else body.pinned
+def add_soft(
+    spec: mujoco.MjSpec, body: SoftBody, name: str, carriers: Sequence[tuple[str, np.ndarray]] = ()
+) -> Points:
+    """The flex, a body for every free vertex or node, and one for every motion of pins. Raises SceneError.
+
+    carriers: name and centre [3] m of the rigid body of each of the body's ties
+    """
+    held = np.zeros(len(body.vertices), bool) if body.pinned is None else body.pinned.copy()
     driver = np.full(len(body.vertices), -1)
+    drivers = [(pin_name(name, k), np.zeros(3)) for k in range(len(body.motions))]
     for k, motion in enumerate(body.motions):
         driver[motion.vertices] = k
+    for k, tie in enumerate(body.ties, len(drivers)):
+        driver[tie.vertices], held[tie.vertices] = k, True
+    drivers += carriers
     positions, masses = body.vertices, body.masses
     leader = np.arange(len(positions))
     if body.reduction != "full":
@@ -65,10 +79,11 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
             item.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             item.armature, item.damping, item.frictionloss = 0.0, [0.0] * 3, 0.0
     owners = [
-        names[leader[i]] or (pin_name(name, driver[i]) if driver[i] >= 0 else "world")
+        names[leader[i]] or (drivers[driver[i]][0] if driver[i] >= 0 else "world")
         for i in range(len(positions))
     ]
-    local = np.where(held[:, None], positions, positions - positions[leader])
+    origins = np.stack([np.zeros(3), *(origin for _, origin in drivers)])[driver + 1]
+    local = positions - np.where(held[:, None], origins, positions[leader])
     flex = spec.add_flex(name=name, dim=3)
     flex.elem = body.tets.ravel().tolist()
     if body.reduction == "full":
@@ -89,7 +104,7 @@ def add_soft(spec: mujoco.MjSpec, body: SoftBody, name: str) -> Points:
         mujoco.mjtFlexSelf.mjFLEXSELF_AUTO if body.self_contact else mujoco.mjtFlexSelf.mjFLEXSELF_NONE
     )
     set_contact(flex, body.friction, FLEX_REFERENCE)
-    return Points(positions, masses, tuple(names))
+    return Points(positions, masses, tuple(names), tuple(owners), local)
 
 
 def pin_name(name: str, k: int) -> str:

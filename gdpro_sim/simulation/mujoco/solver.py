@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.errors import SolverError
+from gdpro_sim.simulation.callbacks import Callback, taken
 from gdpro_sim.simulation.conditions import Guide, Motion, pose_at
 from gdpro_sim.simulation.model import Diagnostics, Model
 from gdpro_sim.simulation.mujoco import soft
+from gdpro_sim.simulation.mujoco.controls import called
 from gdpro_sim.simulation.mujoco.energy import elastic_energy, volume_ratios
+from gdpro_sim.simulation.mujoco.loads import Loads
 from gdpro_sim.simulation.mujoco.world import World, build, compile_spec
 from gdpro_sim.simulation.mujoco_model import RigidBody, SoftBody
 
@@ -53,6 +57,9 @@ class SolverMuJoCo:
     """Rigid and soft bodies in MuJoCo.
 
     mjmodel, mjdata: MuJoCo's own; actuators of a base may be driven through `mjdata.ctrl` between steps
+    callback:        (time in s, `mjdata`) -> what actuators are told by name, or of all in their order, or
+                     None; called before every step of MuJoCo, after the keyframes. What it depends on besides
+                     is not part of the state
     renamed:         (our name, the name taken) of bodies whose names a base had already
     counted:         [nbody] bool, bodies that diagnostics count: not the obstacles that are moved
     wrenches:        [nbody, 6] N and N m about the centre of mass, world axes: they push bodies in every step
@@ -81,6 +88,12 @@ class SolverMuJoCo:
         driven = {self.mjmodel.body(name).id for name, *_ in self._driven}
         self.counted = np.array([i not in driven for i in range(self.mjmodel.nbody)])
         self.wrenches = np.zeros((self.mjmodel.nbody, 6))
+        self.callback: Callback | Callable[..., Any] | None = model.mujoco.callback
+        self._timestep = model.mujoco.settings.timestep
+        self._loads = Loads(model, self.mjmodel, self.world.names, self.world.points, self._timestep)
+        if self._loads.longest < self._timestep:
+            self._timestep = self._loads.longest
+            log.info("springs ask for steps of %.2g s at most", self._timestep)
         self._count = _Count()
         self.reset()
 
@@ -120,7 +133,12 @@ class SolverMuJoCo:
         begin = data.time
         for k in range(count):
             self._drive(begin + k * dt / count, dt / count)
-            data.xfrc_applied[:] = self.wrenches
+            try:
+                self._push(dt / count)
+                self._control()
+            except SolverError:
+                mujoco.mj_setState(model, data, before, STATE)
+                raise
             mujoco.mj_step(model, data)
             rounds = int(np.max(data.solver_niter)) if data.nefc else 0
             result.iterations += rounds
@@ -203,6 +221,7 @@ class SolverMuJoCo:
             cg_iterations=0,
             converged=self._count.converged,
             residual=self._count.residual,
+            force_energy=self._loads.stored(self._view),
         )
 
     # ---- more than the protocol ----
@@ -217,8 +236,7 @@ class SolverMuJoCo:
 
     def substeps(self, dt: float) -> int:
         """MuJoCo's own steps in a `step(dt)`."""
-        assert self.model.mujoco is not None
-        return max(1, math.ceil(dt / self.model.mujoco.settings.timestep - 1e-9))
+        return max(1, math.ceil(dt / self._timestep - 1e-9))
 
     def frames(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [B, 3, 3] and centres of mass [B, 3] m of MuJoCo's own bodies by their `numbers` [B]."""
@@ -281,6 +299,24 @@ class SolverMuJoCo:
         for control in self.model.mujoco.controls:
             value = np.interp(time, control.times, control.values)
             self.mjdata.actuator(control.actuator).ctrl = value
+
+    def _push(self, h: float) -> None:
+        """Set what pulls and pushes bodies in the `h` s that follow."""
+        data, view = self.mjdata, self._view
+        data.xfrc_applied[:] = self.wrenches
+        if self._loads:
+            view.qpos[:], view.qvel[:] = data.qpos, data.qvel
+            mujoco.mj_kinematics(self.mjmodel, view)
+            mujoco.mj_comPos(self.mjmodel, view)
+            mujoco.mj_comVel(self.mjmodel, view)
+            data.xfrc_applied[:] += self._loads.wrenches(view, float(data.time), h)
+
+    def _control(self) -> None:
+        """Ask the callback what actuators do. Raises SolverError where it fails."""
+        if self.callback is not None:
+            told = called(taken(self.callback), self.mjmodel, self.mjdata)
+            for actuator, value in told.items():
+                self.mjdata.ctrl[actuator] = value
 
     def _driven_bodies(self) -> Iterator[tuple[str, Motion | Guide, np.ndarray, np.ndarray]]:
         """(name, motion, rotation [3, 3] and position [3] m at the start) of moved obstacles and pins."""

@@ -24,6 +24,9 @@ log = logging.getLogger(__name__)
 CONVEX = 0.99
 """A mesh that fills this share of its convex hull is taken as convex."""
 
+FIRM = (0.99, 0.999, 0.001, 0.5, 2.0)
+"""`solimp` of what holds two bodies to each other."""
+
 MEMORY = 64 << 20
 """Bytes of MuJoCo's stack and contact arena at least; more where there are many points."""
 
@@ -71,18 +74,20 @@ def build(model: Model) -> World:
     geoms: list[
         tuple[float, list[Any], tuple[float, float]]
     ] = []  # friction, geoms, solref of each rigid body
-    names: list[str] = []
+    names = [name(body.name) for body in world.bodies]
     points: list[soft.Points | None] = []
-    for body in world.bodies:
-        title = name(body.name)
-        names.append(title)
+    for body, title in zip(world.bodies, names, strict=True):
         if isinstance(body, RigidBody):
             _, shapes = rigid.add_rigid(spec, body, title, step)
             geoms.append((body.friction, shapes, reference(body.restitution, step)))
             points.append(None)
         else:
-            points.append(soft.add_soft(spec, body, title))
+            carriers = [(names[tie.body], _rigid(world, tie.body).centre) for tie in body.ties]
+            points.append(soft.add_soft(spec, body, title, carriers))
+    _weigh(spec, world, names, points)
     _pairs(spec, geoms)
+    for a, b in world.welds:
+        _weld(spec, names[a], names[b], step)
     if model.ground is not None:
         floor = spec.worldbody.add_geom(name=name("ground"), type=mujoco.mjtGeom.mjGEOM_PLANE)
         floor.pos, floor.size = [0.0, 0.0, model.ground.height], [0.0, 0.0, 1.0]
@@ -171,6 +176,36 @@ def _options(spec: mujoco.MjSpec, model: Model, world: MujocoWorld) -> None:
         option.integrator, option.solver = kind, mujoco.mjtSolver.mjSOL_NEWTON
 
 
+def _rigid(world: MujocoWorld, number: int) -> RigidBody:
+    body = world.bodies[number]
+    assert isinstance(body, RigidBody)
+    return body
+
+
+def _weigh(
+    spec: mujoco.MjSpec, world: MujocoWorld, names: list[str], points: list[soft.Points | None]
+) -> None:
+    """Give rigid bodies the mass of what is tied to them."""
+    tied = {tie.body for body in world.bodies if isinstance(body, SoftBody) for tie in body.ties}
+    for number in sorted(tied):
+        carried = [item for item in points if item is not None]
+        chosen = [np.array([owner == names[number] for owner in item.owners]) for item in carried]
+        where = np.concatenate([item.positions[own] for item, own in zip(carried, chosen, strict=True)])
+        mass = np.concatenate([item.masses[own] for item, own in zip(carried, chosen, strict=True)])
+        rigid.load_mass(spec.body(names[number]), _rigid(world, number), where, mass)
+
+
+def _weld(spec: mujoco.MjSpec, a: str, b: str, step: float) -> None:
+    """Hold two bodies to each other as they stand; they do not touch then."""
+    held = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+    held.name1, held.name2 = a, b
+    data = np.zeros_like(held.data)  # a relative pose without a quaternion is that of the start
+    data[10] = 1.0  # torques count as much as forces
+    held.data = data
+    held.solref, held.solimp = [2.0 * step, 1.0], list(FIRM)
+    spec.add_exclude(bodyname1=a, bodyname2=b)
+
+
 def _passive(geom: Any, friction: float) -> None:
     """A geom whose partner decides: friction and stiffness are the larger of two."""
     geom.rgba = [0.85, 0.85, 0.85, 1.0]
@@ -213,6 +248,10 @@ def _obstacle(
         geom = parent.add_geom(name=title, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
         geom.pos, geom.quat = shift.tolist(), rigid.quaternion(turn)
         made = [geom]
+    elif collider.heights is not None:
+        geom = _terrain(spec, parent, collider, title)
+        geom.pos, geom.quat = (turn @ _middle(collider) + shift).tolist(), rigid.quaternion(turn)
+        made = [geom]
     else:
         placed = [
             Shape(s.kind, s.size, turn @ s.position + shift, turn @ s.rotation, s.vertices, s.faces)
@@ -227,6 +266,26 @@ def _obstacle(
                 for geom in made:
                     add_pair(spec, shape, geom, math.sqrt(friction * collider.friction), solref)
     return title if collider.motion is not None else ""
+
+
+def _terrain(spec: mujoco.MjSpec, parent: Any, collider: Collider, title: str) -> Any:
+    assert collider.heights is not None and collider.vertices is not None
+    rows, columns = collider.heights.shape
+    low, high = collider.vertices.min(axis=0), collider.vertices.max(axis=0)
+    least = float(collider.heights.min())
+    span = max(float(np.ptp(collider.heights)), 1e-6 * float(high[0] - low[0]))  # MuJoCo takes no flat ones
+    spec.add_hfield(
+        name=title, nrow=rows, ncol=columns, userdata=((collider.heights - least) / span).ravel().tolist(),
+        size=[*(0.5 * (high - low)[:2]).tolist(), span, least - float(low[2])],
+    )  # fmt: skip
+    return parent.add_geom(name=title, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=title)
+
+
+def _middle(collider: Collider) -> np.ndarray:
+    """[3] m of a terrain: under its middle, where its lowest point is."""
+    assert collider.heights is not None and collider.vertices is not None
+    low, high = collider.vertices.min(axis=0), collider.vertices.max(axis=0)
+    return np.array([*(0.5 * (low + high)[:2]), float(collider.heights.min())])
 
 
 def _shapes(collider: Collider) -> list[Shape]:
