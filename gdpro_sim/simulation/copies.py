@@ -162,13 +162,13 @@ def expand(bodies: tuple[SceneBody, ...], seed: int) -> tuple[SceneBody, ...]:
             raise ValueError(f"two bodies are named {body.name!r}; give each a `name` of its own")
         seen.add(body.name)
     out: list[SceneBody] = []
+    clashes: list[str] = []
     for body in bodies:
-        out += [body] if body.copies is None else _copies(body, body.copies, seed)
-    made = [body.name for body in out if body.copied is not None and body.name in seen]
-    if made:
-        raise ValueError(
-            f"copies would be named like other bodies: {', '.join(dict.fromkeys(made))}; rename those bodies"
-        )
+        made = [body] if body.copies is None else _copies(body, body.copies, seed)
+        clashes += [copy.name for copy in made if copy is not body and copy.name in seen]
+        out += made
+    if clashes:
+        raise ValueError(f"copies would be named like other bodies: {', '.join(clashes)}; rename those bodies")
     return tuple(out)
 
 
