@@ -15,7 +15,15 @@ from gdpro_sim.asset import Asset, import_mesh, kind, tetrahedralize_asset
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
+from gdpro_sim.simulation.animation_options import AnimationOptions
 from gdpro_sim.simulation.colliders import MeshCollider, compile_collider
+from gdpro_sim.simulation.compile_animation import (
+    animated_asset,
+    compile_animation,
+    motion_file,
+    moves_itself,
+)
+from gdpro_sim.simulation.compile_animation import check_supported as animation_supports
 from gdpro_sim.simulation.compile_coupled import as_part, compile_coupled, part_of
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
 from gdpro_sim.simulation.compile_mpm import check_supported as mpm_supports
@@ -47,6 +55,9 @@ def check_files(scene: Scene) -> None:
             if reference is not None and not scene.resolve(reference).exists():
                 path = scene.resolve(reference)
                 raise SceneError(f"{scene.name}: bodies[{body.name}].{key}: {path}: no such file")
+        if body.animation is not None and not motion_file(scene, body).exists():
+            path = motion_file(scene, body)
+            raise SceneError(f"{scene.name}: bodies[{body.name}].animation.file: {path}: no such file")
     rigid = scene.mujoco_options
     if rigid is not None and rigid.base is not None and not scene.resolve(rigid.base).is_file():
         path = scene.resolve(rigid.base)
@@ -91,7 +102,9 @@ def load_assets(
 def _load_asset(scene: Scene, body: SceneBody, tell: Callable[[str], None]) -> Asset:
     path = scene.resolve(body.asset)
     tell(f"preparing {body.source}")
-    if kind(path) == "asset":
+    if moves_itself(scene, body):
+        asset = animated_asset(scene, body, on_progress=tell)
+    elif kind(path) == "asset":
         ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
         if ignored:
             raise SceneError(
@@ -137,6 +150,8 @@ def check_supported(scene: Scene) -> None:
         mpm_supports(scene)
     elif isinstance(scene.solver, MujocoOptions):
         mujoco_supports(scene)
+    elif isinstance(scene.solver, AnimationOptions):
+        animation_supports(scene)
     elif isinstance(scene.solver, FemOptions):
         for body in scene.bodies:
             if body.material is not None:
@@ -161,6 +176,8 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
     if isinstance(options, MujocoOptions):
         _tell_one_material(assets)
         return compile_mujoco(scene, options, assets, device=device)
+    if isinstance(options, AnimationOptions):
+        return compile_animation(scene, assets, device=device)
     if isinstance(options, CoupledOptions):
         return compile_coupled(scene, options, assets, partial(compile_scene, device=device))
     bodies: list[Body] = []

@@ -8,18 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from gdpro_sim.asset import Asset, bind_asset
 from gdpro_sim.binding import vertex_normals
-from gdpro_sim.errors import MeshError, RequestError, SceneError
+from gdpro_sim.errors import RequestError, SceneError
 from gdpro_sim.simulation.animation import Motion, open_motion
-from gdpro_sim.simulation.animation.follow import Fit, fit_to_surface, torn
+from gdpro_sim.simulation.animation.follow import SurfaceFollower, fit_to_surface, torn
 from gdpro_sim.simulation.animation.solver import AnimatedBody
 from gdpro_sim.simulation.animation_options import BodyAnimation
 from gdpro_sim.simulation.colliders import compile_collider
 from gdpro_sim.simulation.model import Body, Ground, Model, Particles
-from gdpro_sim.simulation.placement import Placement, place
+from gdpro_sim.simulation.placement import Placement, place_bodies
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.scene_body import SceneBody
 
@@ -70,12 +69,16 @@ def animated_asset(
 
 
 def compile_animation(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu") -> Model:
-    """A `Model` whose bodies follow motions. Raises SceneError for what has no effect without physics, and for
-    an asset that does not lie on its motion's mesh; MeshError for a motion that cannot be read."""
-    _check_supported(scene)
-    bodies, animation = [], []
-    for body in scene.bodies:
-        placement = place(scene, body, assets[body.name])
+    """A `Model` whose bodies follow motions.
+
+    Raises SceneError for what has no effect without physics, and for an asset that does not lie on its
+    motion's mesh; MeshError for a motion that cannot be read.
+    """
+    check_supported(scene)
+    bodies: list[Body] = []
+    animation: list[AnimatedBody | None] = []
+    riding: dict[str, tuple[Motion, SurfaceFollower]] = {}
+    for body, placement in zip(scene.bodies, place_bodies(scene, assets), strict=True):
         bodies.append(
             Body(
                 name=body.name,
@@ -85,9 +88,12 @@ def compile_animation(scene: Scene, assets: dict[str, Asset], *, device: str = "
                 placement=placement,
             )
         )
-        animation.append(
-            None if body.animation is None else _animated(scene, body, assets[body.name], placement)
-        )
+        if body.animation is None:
+            animation.append(None)
+            continue
+        if body.source not in riding:
+            riding[body.source] = _riding(scene, body, assets[body.name])
+        animation.append(_animated(scene, body, *riding[body.source], assets[body.name], placement))
     none = Particles(
         np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32),
         np.zeros(0, np.int32), (), 0.0,
@@ -113,23 +119,38 @@ def _open(scene: Scene, body: SceneBody) -> Motion:
         raise type(error)(f"{scene.name}: body {body.name!r}: animation: {error}") from error
 
 
-def _animated(scene: Scene, body: SceneBody, asset: Asset, placement: Placement) -> AnimatedBody:
+def _riding(scene: Scene, body: SceneBody, asset: Asset) -> tuple[Motion, SurfaceFollower]:
+    """A body's motion, and how its asset's surface rides on it."""
     own = body.animation
     assert own is not None
     motion = _open(scene, body)
-    start, end = _span(f"{scene.name}: body {body.name!r}: animation", own, motion)
-    fit = _fit(f"{scene.name}: body {body.name!r}", asset, motion, own.tolerance)
-    apart = max(torn(motion.rest, motion.vertices(t)) for t in np.linspace(start, end, LOOKS))
+    follower = _follower(f"{scene.name}: body {body.name!r}", asset, motion, own.tolerance)
+    moments = np.linspace(motion.begin, motion.end, LOOKS)
+    apart = max(torn(motion.rest, motion.vertices(moment)) for moment in moments)
     size = float(np.linalg.norm(np.ptp(motion.rest, axis=0)))
     if apart > TORN * size:
         log.warning(
-            "body %r: vertices of %s that lie in one place at rest come apart by up to %.3g m; its surface is "
-            "joined there, and stretches", body.name, motion.path.name, apart,
+            "body %r: vertices of %s that lie in one place at rest come apart by up to %.3g m; its surface "
+            "is joined there, and stretches", body.name, motion.path.name, apart,
         )  # fmt: skip
-    rest = asset.gaussians.vertices.cpu().numpy()
-    factor = float(np.ptp(placement.asset.gaussians.vertices.cpu().numpy()) / np.ptp(rest))
+    return motion, follower
+
+
+def _animated(
+    scene: Scene,
+    body: SceneBody,
+    motion: Motion,
+    follower: SurfaceFollower,
+    asset: Asset,
+    placement: Placement,
+) -> AnimatedBody:
+    own = body.animation
+    assert own is not None
+    start, end = _span(f"{scene.name}: body {body.name!r}: animation", own, motion)
+    size = float(np.ptp(asset.gaussians.vertices.cpu().numpy(), axis=0).max())
+    factor = body.scale if body.size is None else body.size / size
     return AnimatedBody(
-        motion, fit.follower, start, end, own.speed, own.loop, factor, placement.turn, placement.shift
+        motion, follower, start, end, own.speed, own.loop, factor, placement.turn, placement.shift
     )
 
 
@@ -145,7 +166,7 @@ def _span(where: str, own: BodyAnimation, motion: Motion) -> tuple[float, float]
     return max(start, motion.begin), min(end, motion.end)
 
 
-def _fit(where: str, asset: Asset, motion: Motion, tolerance: float) -> Fit:
+def _follower(where: str, asset: Asset, motion: Motion, tolerance: float) -> SurfaceFollower:
     """How the asset rides on the motion: on its rest pose or, where that fits better, its first frame."""
     bound = asset.gaussians.to("cpu")
     if bound.is_loose:
@@ -161,20 +182,20 @@ def _fit(where: str, asset: Asset, motion: Motion, tolerance: float) -> Fit:
     far = best.distance > tolerance * size
     if far.any():
         raise SceneError(
-            f"{where}: {int(far.sum()):,} of {len(points):,} vertices lie more than {tolerance * size:.3g} m off "
-            f"the mesh of {motion.path.name}, up to {float(best.distance.max()):.3g} m. The asset reaches from "
-            f"{_corner(points.min(axis=0))} to {_corner(points.max(axis=0))} m, the mesh from "
-            f"{_corner(motion.rest.min(axis=0))} to {_corner(motion.rest.max(axis=0))} m: give the asset made "
-            "of this mesh, a fitting `scale` or `up`, or a larger `tolerance`"
+            f"{where}: {int(far.sum()):,} of {len(points):,} vertices lie more than {tolerance * size:.3g} m "
+            f"off the mesh of {motion.path.name}, up to {float(best.distance.max()):.3g} m. The asset reaches "
+            f"from {_extent(points)} m, the mesh from {_extent(motion.rest)} m: give the asset made of this "
+            "mesh, a fitting `scale` or `up`, or a larger `tolerance`"
         )
-    return best
+    return best.follower
 
 
-def _corner(point: np.ndarray) -> str:
-    return "[" + ", ".join(f"{x:.3g}" for x in point) + "]"
+def _extent(points: np.ndarray) -> str:
+    low, high = ("[" + ", ".join(f"{x:.3g}" for x in p) + "]" for p in (points.min(0), points.max(0)))
+    return f"{low} to {high}"
 
 
-def _check_supported(scene: Scene) -> None:
+def check_supported(scene: Scene) -> None:
     """Raise SceneError for what needs a solver that computes motion."""
     none = (0.0, 0.0, 0.0)
     given = {
@@ -192,8 +213,8 @@ def _check_supported(scene: Scene) -> None:
     for key, present in given.items():
         if present:
             raise SceneError(
-                f"{scene.name}: {key}: has no effect without physics; remove it, or choose a solver that has some"
+                f"{scene.name}: {key}: has no effect without physics; remove it, or choose another solver"
             )
 
 
-__all__ = ["animated_asset", "compile_animation", "motion_file", "moves_itself"]
+__all__ = ["animated_asset", "check_supported", "compile_animation", "motion_file", "moves_itself"]

@@ -15,6 +15,7 @@ from gdpro_sim.simulation.conditions import Hold, Load, Motion, Springs
 from gdpro_sim.simulation.mujoco_model import MujocoWorld
 
 if TYPE_CHECKING:
+    from gdpro_sim.simulation.animation.solver import AnimatedBody
     from gdpro_sim.simulation.placement import Placement
 
 
@@ -223,6 +224,7 @@ class Model:
     yield_stress, hardening: [T] Pa, of elements with the law "stvk_hencky"; inf does not yield; None: none do
     particles:   material points of the bodies that MPM simulates; None: FEM simulates tets
     mujoco:      rigid and soft bodies that MuJoCo simulates, in the order of `bodies`; None: others simulate
+    animation:   how each of `bodies` follows a motion, None for one that stands still; None: others simulate
     coupling:    several solvers' models, whose arrays stand here, too; None: one solver simulates all
     """
 
@@ -255,6 +257,7 @@ class Model:
     holds: tuple[Hold, ...] = ()
     mpm: MpmSettings = MpmSettings()
     mujoco: MujocoWorld | None = None
+    animation: tuple[AnimatedBody | None, ...] | None = None
     coupling: Coupling | None = None
 
     @staticmethod

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import Asset
+from gdpro_sim.asset.compose import anchor_point
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.simulation.options import Vector, color_of
@@ -139,7 +140,7 @@ def _placed(scene: Scene, body: SceneBody, asset: Asset, colors: np.ndarray | No
 
     def stand(position: Vector, rotation: Vector) -> tuple[np.ndarray, np.ndarray]:
         turn = Rotation.from_euler("xyz", rotation, degrees=True).as_matrix()
-        return turn, np.asarray(position) - _anchor(rest @ turn.T, body.anchor)
+        return turn, np.asarray(position) - anchor_point(rest @ turn.T, body.anchor)
 
     turn, shift = stand(body.position, body.rotation)
     written = None if body.copied is None else stand(body.copied.position, body.copied.rotation)
@@ -151,14 +152,6 @@ def _placed(scene: Scene, body: SceneBody, asset: Asset, colors: np.ndarray | No
 def material_of(body: SceneBody, asset: Asset) -> Material:
     """The scene's, else the asset's, else jelly."""
     return body.material or asset.material or Material.model_validate(FALLBACK_MATERIAL)
-
-
-def _anchor(points: np.ndarray, anchor: str) -> np.ndarray:
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre = 0.5 * (low + high)
-    if anchor == "bottom":
-        return np.array([centre[0], centre[1], low[2]])
-    return centre if anchor == "center" else np.zeros(3)
 
 
 def _check_above_ground(scene: Scene, body: SceneBody, surface: np.ndarray) -> None:

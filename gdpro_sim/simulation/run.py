@@ -90,7 +90,7 @@ class Simulation:
 
 def solver_of(model: Model) -> Solver:
     """The solver of a model: MPM where it has particles, MuJoCo where it has its bodies, all of them where it
-    is coupled, else FEM.
+    is coupled, none of them where motions move its bodies, else FEM.
 
     Raises SceneError or SolverError.
     """
@@ -99,6 +99,10 @@ def solver_of(model: Model) -> Solver:
         from gdpro_sim.simulation.coupled import SolverCoupled
 
         return SolverCoupled(model)
+    if model.animation is not None:
+        from gdpro_sim.simulation.animation.solver import SolverAnimation
+
+        return SolverAnimation(model)
     if model.particles is not None:
         from gdpro_sim.simulation.mpm import SolverMPM
 

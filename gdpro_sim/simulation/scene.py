@@ -69,7 +69,8 @@ class Scene(Options):
     render: Render = Field(default_factory=Render)
     solver: SolverOptions = Field(
         default_factory=FemOptions,
-        description="FEM, `kind: mpm`, `kind: mujoco`, or `kind: coupled`: each body by its own",
+        description="FEM, `kind: mpm`, `kind: mujoco`, `kind: coupled`: each body by its own, or "
+        "`kind: animation`: no physics, bodies follow motions",
     )
     colliders: tuple[ColliderOptions, ...] = Field(
         default=(), description="rigid obstacles, at rest or moving; one or several"
@@ -160,6 +161,11 @@ class Scene(Options):
                     f"{where}.mujoco: belongs to `solver: {{kind: mujoco}}`, but the "
                     f"{'body' if coupled else 'scene'}'s solver is {body.solver if coupled else kind}"
                 )
+            if body.animation is not None and kind != "animation":
+                raise ValueError(
+                    f"{where}.animation: belongs to `solver: {{kind: animation}}`, but the scene's solver is "
+                    f"{kind}"
+                )
         if isinstance(self.solver, FemOptions) and self.solver.integrator == "quasi-static":
             for body in self.bodies:
                 if body.impulses:
@@ -184,6 +190,7 @@ class Scene(Options):
     def files(self) -> list[str]:
         """References to every file the scene reads, as they are written in it."""
         named = [reference for body in self.bodies for reference in (body.asset, body.texture)]
+        named += [body.animation.file for body in self.bodies if body.animation is not None]
         named += [collider.file for collider in self.colliders if isinstance(collider, MeshCollider)]
         if self.mujoco_options is not None:
             named.append(self.mujoco_options.base)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from gdpro_sim.materials import Material
+from gdpro_sim.simulation.animation_options import BodyAnimation
 from gdpro_sim.simulation.copies import Copied, Copies
 from gdpro_sim.simulation.forces import ConstantForce, Pin, Push, SurfacePressure
 from gdpro_sim.simulation.mujoco_options import MujocoBody
@@ -81,6 +82,9 @@ class SceneBody(Options):
         "entry or a Young's modulus of 1e8 Pa or more, else fem",
     )
     mujoco: MujocoBody | None = Field(default=None, description="what it is to the MuJoCo solver")
+    animation: BodyAnimation | None = Field(
+        default=None, description="the motion it follows, where the solver is `animation`"
+    )
 
     copied: Copied | None = Field(default=None, description="set by `copies`")
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from gdpro_sim.simulation.animation_options import AnimationOptions
 from gdpro_sim.simulation.model import Coupling, FemSettings, Integrator, MpmSettings
 from gdpro_sim.simulation.mujoco_options import MujocoOptions
 from gdpro_sim.simulation.options import Options, Vector
@@ -158,7 +159,7 @@ class CoupledOptions(Options):
 
 
 SolverOptions = Annotated[
-    FemOptions | MpmOptions | MujocoOptions | CoupledOptions, Field(discriminator="kind")
+    FemOptions | MpmOptions | MujocoOptions | CoupledOptions | AnimationOptions, Field(discriminator="kind")
 ]
 
 __all__ = ["CoupledOptions", "FemOptions", "MpmOptions", "SolverOptions"]
