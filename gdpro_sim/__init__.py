@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "Asset": "gdpro_sim.asset",
+    "ComposedPart": "gdpro_sim.asset",
     "BoundGaussians": "gdpro_sim.binding",
     "Cameras": "gdpro_sim.cameras",
     "Gaussians": "gdpro_sim.gaussians",
@@ -21,6 +22,8 @@ _PUBLIC = {
     "RasterOptions": "gdpro_sim.splatting",
     "Simulation": "gdpro_sim.simulation.run",
     "Scene": "gdpro_sim.simulation.scene",
+    "animate": "gdpro_sim.io.animate",
+    "compose": "gdpro_sim.asset",
     "generate": "gdpro_sim.io.generate",
     "import_mesh": "gdpro_sim.asset",
     "load_scene": "gdpro_sim.simulation.scene",
@@ -31,11 +34,12 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
-    from gdpro_sim.asset import Asset, import_mesh
+    from gdpro_sim.asset import Asset, ComposedPart, compose, import_mesh
     from gdpro_sim.binding import BoundGaussians
     from gdpro_sim.cameras import Cameras
     from gdpro_sim.errors import GdproError
     from gdpro_sim.gaussians import Gaussians
+    from gdpro_sim.io.animate import animate
     from gdpro_sim.io.generate import generate
     from gdpro_sim.io.record import record
     from gdpro_sim.materials import Material
@@ -61,6 +65,7 @@ __all__ = [
     "Asset",
     "BoundGaussians",
     "Cameras",
+    "ComposedPart",
     "Frame",
     "Gaussians",
     "GdproError",
@@ -68,6 +73,8 @@ __all__ = [
     "RasterOptions",
     "Scene",
     "Simulation",
+    "animate",
+    "compose",
     "generate",
     "import_mesh",
     "load_scene",

@@ -9,7 +9,20 @@ from typing import Annotated, Any
 
 import typer
 
-from gdpro_sim.cli.common import AsJson, Debug, Device, Quiet, app, check_suffix, progress, setup, show
+from gdpro_sim.cli.common import (
+    AsJson,
+    Color,
+    Debug,
+    Device,
+    Quiet,
+    app,
+    check_choice,
+    check_exists,
+    check_suffix,
+    progress,
+    setup,
+    show,
+)
 from gdpro_sim.errors import RequestError
 
 VECTORS = ("position", "rotation")
@@ -74,6 +87,87 @@ def compose(
     if not json_output:
         summary["licenses"] = summary.pop("provenance")["licenses"]
     show(summary, f"Asset {output}", json_output, quiet)
+
+
+@app.command()
+def animate(
+    asset: Annotated[Path, typer.Argument(help="Asset or mesh; or the motion itself, whose mesh is taken.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    motion: Annotated[
+        Path | None,
+        typer.Option("--motion", "-m", help="glTF, USD or .npz, or folder of numbered meshes."),
+    ] = None,
+    fps: Annotated[
+        int | None,
+        typer.Option("--fps", min=1, max=1000, help="Frames per second; default: the motion's, or 30."),
+    ] = None,
+    start: Annotated[float | None, typer.Option("--start", help="Begin there in the motion, s.")] = None,
+    end: Annotated[float | None, typer.Option("--end", help="End there in the motion, s.")] = None,
+    loop: Annotated[int, typer.Option("--loop", min=1, max=10_000, help="How many times.")] = 1,
+    speed: Annotated[float, typer.Option("--speed", help="Seconds of the motion per second.")] = 1.0,
+    clip: Annotated[
+        str | None, typer.Option("--clip", help="Name or number of a glTF file's animation.")
+    ] = None,
+    up: Annotated[str, typer.Option("--up", help="Up axis of the motion: auto, y or z.")] = "auto",
+    scale: Annotated[
+        float | None, typer.Option("--scale", help="Multiply the motion's lengths, e.g. 0.01 for cm.")
+    ] = None,
+    budget: Annotated[
+        int, typer.Option("--budget", min=100, max=5_000_000, help="Gaussians to aim for on a mesh.")
+    ] = 50_000,
+    color: Color = None,
+    texture: Annotated[Path | None, typer.Option("--texture", help="Texture image of the mesh.")] = None,
+    tolerance: Annotated[
+        float | None, typer.Option("--tolerance", help="Asset off the motion, share of its size: 0.02.")
+    ] = None,
+    width: Annotated[int, typer.Option("--width", min=16, max=8192, help="Even.")] = 960,
+    height: Annotated[int, typer.Option("--height", min=16, max=8192, help="Even.")] = 720,
+    device: Device = "auto",
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Start again instead of continuing a stopped run.")
+    ] = False,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Let a skeleton, blend shapes or a mesh sequence move an asset, without physics.
+
+    Writes what `gdpro simulate` writes: time-sampled USD, pictures, video, contact sheet.
+    """
+    setup(quiet, debug)
+    check_exists(asset)
+    check_choice("--up", up, ("auto", "y", "z"))
+    if motion is not None:
+        check_exists(motion)
+    from gdpro_sim.io.animate import animate as run
+
+    with progress(quiet) as report:
+        recording = run(
+            asset,
+            output,
+            motion=motion,
+            fps=fps,
+            start=start,
+            end=end,
+            loop=loop,
+            speed=speed,
+            clip=clip,
+            up=up,
+            scale=scale,
+            budget=budget,
+            color=color,
+            texture=texture,
+            tolerance=tolerance,
+            camera={"width": width, "height": height},
+            device=device,
+            fresh=fresh,
+            on_progress=report,
+        )
+    found = recording.to_json()
+    if not json_output:
+        keys = ("assets", "simulation", "video", "contact_sheet", "frames", "frame_count", "gaussians")
+        found = {key: found[key] for key in keys}
+    show(found, f"Animation of {asset.name}", json_output, quiet)
 
 
 def _part(text: str) -> dict[str, Any]:

@@ -312,7 +312,11 @@ def _write_metrics(path: Path, rows: list[dict[str, Any]]) -> None:
 def reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box in m that the camera should show: flight, landing and slide of every body."""
     boxes = []
-    for body, placed in zip(scene.bodies, simulation.model.bodies, strict=True):
+    motions = simulation.model.animation or (None,) * len(scene.bodies)
+    for body, placed, motion in zip(scene.bodies, simulation.model.bodies, motions, strict=True):
+        if motion is not None:
+            boxes.append(motion.bounds(scene.duration))
+            continue
         low, high = placed.surface.min(axis=0).astype(float), placed.surface.max(axis=0).astype(float)
         friction = material_of(body, simulation.assets[body.name]).friction
         for shift in _path(scene, body, low, float((high - low).max()), friction):
@@ -394,7 +398,8 @@ def fingerprint(scene: Scene, device: str) -> str:
     for reference in scene.files:
         path = scene.resolve(reference)
         beside = path.parent.glob(f"{glob.escape(path.stem)}.*")  # .mtl, textures, buffers
-        for file in sorted({path, *beside}):
+        inside = path.iterdir() if path.is_dir() else ()
+        for file in sorted({path, *beside, *inside}):
             if file.is_file():
                 digest.update(sha256_of(file).encode())
     for callback in callbacks_of(scene):

@@ -183,8 +183,8 @@ def _follower(where: str, asset: Asset, motion: Motion, tolerance: float) -> Sur
     if far.any():
         raise SceneError(
             f"{where}: {int(far.sum()):,} of {len(points):,} vertices lie more than {tolerance * size:.3g} m "
-            f"off the mesh of {motion.path.name}, up to {float(best.distance.max()):.3g} m. The asset reaches "
-            f"from {_extent(points)} m, the mesh from {_extent(motion.rest)} m: give the asset made of this "
+            f"off the mesh of {motion.path.name}, up to {best.distance.max():.3g} m. The asset reaches from "
+            f"{_extent(points)} m, the mesh from {_extent(motion.rest)} m: give the asset made of this "
             "mesh, a fitting `scale` or `up`, or a larger `tolerance`"
         )
     return best.follower

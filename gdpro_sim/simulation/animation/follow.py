@@ -51,9 +51,7 @@ class Fit:
     distance: np.ndarray
 
 
-def fit_to_surface(
-    points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray
-) -> Fit:
+def fit_to_surface(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Fit:
     """Let points [N, 3] m with unit normals [N, 3] ride on the nearest places of a surface.
 
     vertices [V, 3] m, faces [F, 3]. Of the two sides of a thin wall the one that looks the same way counts.

@@ -11,6 +11,9 @@ from gdpro_sim.simulation.animation.follow import SurfaceFollower
 from gdpro_sim.simulation.animation.source import VertexSource
 from gdpro_sim.simulation.model import Diagnostics, Model
 
+LOOKS = 25
+"""Moments at which a motion is looked at for the space it takes."""
+
 
 @dataclass(frozen=True)
 class AnimatedBody:
@@ -40,6 +43,11 @@ class AnimatedBody:
             along -= length * np.ceil(along / length * (1.0 - 1e-12) - 1.0)
         points = self.follower(self.source.vertices(self.start + min(along, length)))
         return ((self.factor * points) @ self.turn.T + self.shift).astype(np.float32)
+
+    def bounds(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
+        """Corners [3] m of a box around where it is at some moments of the first `duration` s."""
+        seen = np.concatenate([self.at(moment) for moment in np.linspace(0.0, duration, LOOKS)])
+        return seen.min(axis=0).astype(float), seen.max(axis=0).astype(float)
 
 
 class SolverAnimation:
@@ -91,4 +99,4 @@ class SolverAnimation:
         )
 
 
-__all__ = ["AnimatedBody", "SolverAnimation"]
+__all__ = ["LOOKS", "AnimatedBody", "SolverAnimation"]
