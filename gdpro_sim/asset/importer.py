@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 from gdpro_sim.asset.asset import Asset
 from gdpro_sim.asset.from_mesh import bind_mesh, vertex_colors
+from gdpro_sim.asset.groups import mask_groups, material_groups
 from gdpro_sim.asset.prims import to_numpy
 from gdpro_sim.asset.stage import kind
 from gdpro_sim.errors import AssetError, MeshError
@@ -44,6 +45,7 @@ def import_mesh(
     edge_length: float | None = None,
     tet_method: str = "auto",
     seed: int = 0,
+    masks: Mapping[str, str | Path] | None = None,
     on_progress: Phase | None = None,
 ) -> Asset:
     """Make an asset of a mesh file.
@@ -55,6 +57,8 @@ def import_mesh(
     tets:        False leaves them out: enough to show the asset; simulation adds them when it needs them
     target_tets, edge_length (m), tet_method: as in `gdpro_sim.meshing.tetrahedralize.tetrahedralize`
     seed:        of every random draw; Gaussians repeat to the bit, fTetWild's tets do not
+    masks:       images over the mesh's UV map by name: what they paint white becomes a vertex group; each of
+                 several materials is a group of its own
     on_progress: called with the name of each phase as it begins
 
     >>> import_mesh("bunny.obj", budget=20_000).save("bunny.usdc")  # doctest: +SKIP
@@ -79,7 +83,7 @@ def import_mesh(
         "up": up,
         "scale": scale,
     }
-    return bind_asset(
+    asset = bind_asset(
         mesh,
         name=name if name is not None else path.stem,
         source=path,
@@ -93,6 +97,10 @@ def import_mesh(
         seed=seed,
         on_progress=on_progress,
     )
+    if masks:
+        painted = mask_groups(path, masks, asset.gaussians, up=up, scale=scale)
+        asset = replace(asset, groups={**asset.groups, **painted})
+    return asset
 
 
 def bind_asset(
@@ -133,6 +141,7 @@ def bind_asset(
         vertex_colors=vertex_colors(mesh, bound),
         material=material,
         provenance=provenance,
+        groups=material_groups(mesh, bound),
     )
     if tets:
         asset = tetrahedralize_asset(

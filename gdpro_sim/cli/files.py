@@ -53,6 +53,10 @@ def import_command(
     tets: Annotated[
         int, typer.Option("--tets", min=0, max=500_000, help="Tetrahedra to aim for, roughly; 0 for none.")
     ] = 6_000,
+    mask: Annotated[
+        list[str] | None,
+        typer.Option("--mask", help="NAME=IMAGE over the UV map: what it paints white is a vertex group."),
+    ] = None,
     seed: Seed = None,
     json_output: AsJson = False,
     quiet: Quiet = False,
@@ -73,8 +77,15 @@ def import_command(
 
     cloud = is_cloud(mesh)
     check_choice("--up", up, ("auto", "y", "z", "x", "-x", "-y", "-z") if cloud else ("auto", "y", "z"))
-    if cloud and (color is not None or texture is not None):
-        raise RequestError(f"--color and --texture are for meshes, but {mesh} is a splat cloud")
+    if cloud and (color is not None or texture is not None or mask):
+        raise RequestError(f"--color, --texture and --mask are for meshes, but {mesh} is a splat cloud")
+    masks = {}
+    for given in mask or []:
+        name, _, image = given.partition("=")
+        if not name or not image:
+            raise RequestError(f"--mask must be NAME=IMAGE, got {given!r}")
+        check_exists(Path(image))
+        masks[name] = Path(image)
 
     check_writable(output)
     chosen = None
@@ -99,6 +110,7 @@ def import_command(
                 tets=tets > 0,
                 target_tets=tets or 6_000,
                 seed=seed or 0,
+                masks=masks,
                 on_progress=lambda phase: report(phase, 0, 0),
             )
         )
@@ -158,9 +170,7 @@ def simulate(
     setup(quiet, debug)
     from gdpro_sim.simulation.scene import load_scene
 
-    checked = load_scene(scene)
-    if seed is not None:
-        checked = checked.model_copy(update={"seed": seed})
+    checked = load_scene(scene, seed=seed)
     from gdpro_sim.io.record import record
 
     with progress(quiet) as report:
@@ -196,15 +206,40 @@ def render(
     frames: Annotated[
         int, typer.Option("--frames", min=1, max=10_000, help="Views of an asset's turntable.")
     ] = 24,
+    camera: Annotated[str, typer.Option("--camera", help="Which of the scene's cameras.")] = "main",
     width: Annotated[int | None, typer.Option("--width", min=16, max=8192)] = None,
     height: Annotated[int | None, typer.Option("--height", min=16, max=8192)] = None,
     azimuth: Annotated[float | None, typer.Option("--azimuth", help="Degrees from +X.")] = None,
     elevation: Annotated[
         float | None, typer.Option("--elevation", min=-89.0, max=89.0, help="Degrees.")
     ] = None,
+    distance: Annotated[float | None, typer.Option("--distance", help="From the target, m.")] = None,
     fov: Annotated[float | None, typer.Option("--fov", min=1.0, max=150.0, help="Vertical, degrees.")] = None,
-    shading: Annotated[str, typer.Option("--shading", help="studio or none.")] = "studio",
-    background: Annotated[str, typer.Option("--background", help="studio, white or black.")] = "studio",
+    orbit: Annotated[
+        float | None, typer.Option("--orbit", help="Turns of the camera about its target.")
+    ] = None,
+    lights: Annotated[
+        str | None,
+        typer.Option("--lights", help="studio, overcast, noon, sunset, moonlight or three-point."),
+    ] = None,
+    exposure: Annotated[float | None, typer.Option("--exposure", help="Stops; 1 doubles the light.")] = None,
+    shading: Annotated[str | None, typer.Option("--shading", help="studio or none.")] = None,
+    background: Annotated[
+        str | None, typer.Option("--background", help="studio, transparent, #rrggbb or a CSS colour.")
+    ] = None,
+    catch_shadows: Annotated[
+        bool, typer.Option("--catch-shadows", help="Show the shadows on the floor without the floor.")
+    ] = False,
+    view: Annotated[
+        Path | None,
+        typer.Option("--view", help="YAML with `camera`, `lights`, `render` as in a scene, in its place."),
+    ] = None,
+    passes: Annotated[
+        str, typer.Option("--passes", help="Also write depth, normal, alpha: a list with commas.")
+    ] = "",
+    pass_format: Annotated[str, typer.Option("--pass-format", help="exr or npz.")] = "exr",
+    video: Annotated[bool, typer.Option("--video", help="Also write preview.mp4.")] = False,
+    fps: Annotated[float | None, typer.Option("--fps", help="Frames per second of the video.")] = None,
     device: Device = "auto",
     json_output: AsJson = False,
     quiet: Quiet = False,
@@ -212,23 +247,49 @@ def render(
 ) -> None:
     """Render an asset as a turntable, or every frame of a simulation, to PNG pictures.
 
-    A simulation is seen through its scene's camera, unless the options say otherwise.
+    A simulation is seen through its scene's camera under its lights, unless the options say otherwise.
     """
     setup(quiet, debug)
-    check_choice("--shading", shading, ("studio", "none"))
-    check_choice("--background", background, ("studio", "white", "black"))
+    if shading is not None:
+        check_choice("--shading", shading, ("studio", "none"))
+    check_choice("--pass-format", pass_format, ("exr", "npz"))
     check_exists(file)
-    view = {"azimuth": azimuth, "elevation": elevation, "fov": fov, "width": width, "height": height}
-    from gdpro_sim.io.views import render_file
+    if view is not None:
+        check_exists(view)
+    from gdpro_sim.io.views import Look, read_view, render_file
 
+    changes = {
+        "azimuth": azimuth,
+        "elevation": elevation,
+        "distance": distance,
+        "fov": fov,
+        "width": width,
+        "height": height,
+    }
+    surroundings = {
+        "shading": shading,
+        "background": background,
+        "exposure": exposure,
+        "catch_shadows": catch_shadows or None,
+    }
+    look = Look(
+        camera=camera,
+        view={} if view is None else read_view(view),
+        changes={key: value for key, value in changes.items() if value is not None},
+        orbit=orbit,
+        lights=lights,
+        render={key: value for key, value in surroundings.items() if value is not None},
+    )
     with progress(quiet) as report:
         pictures = render_file(
             file,
             output,
             views=frames,
-            camera={key: value for key, value in view.items() if value is not None},
-            shading=shading,
-            background=background,
+            look=look,
+            passes=[name.strip() for name in passes.split(",") if name.strip()],
+            pass_format=pass_format,
+            video=video or fps is not None,
+            fps=fps,
             device=device,
             on_progress=report,
         )
@@ -272,9 +333,21 @@ def info(
 
 
 @app.command()
-def scenes(json_output: AsJson = False, quiet: Quiet = False, debug: Debug = False) -> None:
+def scenes(
+    reference: Annotated[
+        bool, typer.Option("--reference", help="Print every key a scene may have, as Markdown.")
+    ] = False,
+    json_output: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
     """List the scenes shipped with the package; with --quiet, their names alone."""
     setup(quiet, debug)
+    if reference:
+        from gdpro_sim.simulation.reference import reference as written
+
+        print(written(), end="")
+        return
     from gdpro_sim.simulation.scene import load_scene, scene_names
 
     listing = {name: load_scene(name).description for name in scene_names()}

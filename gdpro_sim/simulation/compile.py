@@ -50,8 +50,8 @@ def check_files(scene: Scene) -> None:
                 f"{scene.name}: bodies[{body.name}].prompt: generate it first (`gdpro simulate` and "
                 "gdpro_sim.record do), and give the asset's file"
             )
-        for key in ("asset", "texture"):
-            reference = getattr(body, key)
+        masks = {f"masks.{name}": mask for name, mask in body.masks.items()}
+        for key, reference in {"asset": body.asset, "texture": body.texture, **masks}.items():
             if reference is not None and not scene.resolve(reference).exists():
                 path = scene.resolve(reference)
                 raise SceneError(f"{scene.name}: bodies[{body.name}].{key}: {path}: no such file")
@@ -105,11 +105,11 @@ def _load_asset(scene: Scene, body: SceneBody, tell: Callable[[str], None]) -> A
     if moves_itself(scene, body):
         asset = animated_asset(scene, body, on_progress=tell)
     elif kind(path) == "asset":
-        ignored = [k for k in ("color", "texture") if getattr(body, k) is not None]
+        ignored = [k for k in ("color", "texture", "masks") if getattr(body, k)]
         if ignored:
             raise SceneError(
                 f"{scene.name}: bodies[{body.source}].{ignored[0]}: applies to a mesh, but {path.name} is "
-                f"an asset with colours of its own; remove the key"
+                f"an asset with colours and groups of its own; remove the key"
             )
         asset = Asset.load(path)
     else:
@@ -123,6 +123,7 @@ def _load_asset(scene: Scene, body: SceneBody, tell: Callable[[str], None]) -> A
             tets=part_of(scene, body) == "fem",
             target_tets=body.tets,
             seed=scene.seed,
+            masks={name: scene.resolve(mask) for name, mask in body.masks.items()},
             on_progress=tell,
         )
     part = part_of(scene, body, asset)

@@ -189,7 +189,11 @@ class Scene(Options):
     @property
     def files(self) -> list[str]:
         """References to every file the scene reads, as they are written in it."""
-        named = [reference for body in self.bodies for reference in (body.asset, body.texture)]
+        named = [
+            reference
+            for body in self.bodies
+            for reference in (body.asset, body.texture, *body.masks.values())
+        ]
         named += [body.animation.file for body in self.bodies if body.animation is not None]
         named += [collider.file for collider in self.colliders if isinstance(collider, MeshCollider)]
         if self.mujoco_options is not None:
@@ -266,14 +270,16 @@ def _for_mpm(asset: Asset) -> bool:
     return cloud or (asset.material is not None and asset.material.mpm_only() is not None)
 
 
-def load_scene(scene: str | Path) -> Scene:
+def load_scene(scene: str | Path, *, seed: int | None = None) -> Scene:
     """Read a scene from a YAML path, or a shipped scene by name; an asset file gets `drop_scene`.
 
+    seed: in place of the scene's own
     Raises SceneError naming the file, the key and what is allowed.
     """
     path = Path(scene).expanduser()
     if path.suffix.lower() in (".usdc", ".usda", ".usdz"):
-        return drop_scene(path)
+        dropped = drop_scene(path)
+        return dropped if seed is None else dropped.model_copy(update={"seed": seed})
     if path.suffix.lower() not in (".yaml", ".yml"):
         names = scene_names()
         if str(scene) not in names:
@@ -290,14 +296,14 @@ def load_scene(scene: str | Path) -> Scene:
         with importlib.resources.as_file(
             importlib.resources.files("gdpro_sim.scenes") / f"{scene}.yaml"
         ) as shipped:
-            return _parse(shipped.read_text(encoding="utf-8"), f"{scene}.yaml", Path.cwd())
+            return _parse(shipped.read_text(encoding="utf-8"), f"{scene}.yaml", Path.cwd(), seed)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; `gdpro scenes` lists the shipped scenes") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: cannot be read as text: {error}") from None
-    return _parse(text, str(path), path.resolve().parent)
+    return _parse(text, str(path), path.resolve().parent, seed)
 
 
 class _UniqueKeys(yaml.SafeLoader):
@@ -329,10 +335,12 @@ def read_mapping(text: str, source: str, what: str) -> dict[str, Any]:
     return data
 
 
-def _parse(text: str, source: str, folder: Path) -> Scene:
+def _parse(text: str, source: str, folder: Path, seed: int | None) -> Scene:
     data = read_mapping(text, source, "a scene is a mapping with at least `bodies:`")
     if "folder" in data:
         raise SceneError(f"{source}: unknown key `folder`; asset paths are relative to the scene file")
+    if seed is not None:
+        data["seed"] = seed
     return check_scene({"name": Path(source).stem, **data, "folder": folder}, source)
 
 

@@ -23,7 +23,7 @@ class Part(Region):
 
 
 class SceneBody(Options):
-    """One soft body."""
+    """One body, soft or rigid; or several copies of one."""
 
     name: str = Field(
         default="", pattern=r"^([A-Za-z_][A-Za-z0-9_]*)?$", description="unique; default: from the file"
@@ -42,6 +42,11 @@ class SceneBody(Options):
     color: str | None = Field(default=None, description="colour of a mesh, #rrggbb or a CSS name")
     texture: str | None = Field(
         default=None, description="texture image of a mesh, relative to the scene file"
+    )
+    masks: dict[str, str] = Field(
+        default_factory=dict,
+        description="of a mesh: images over its UV map, by name, relative to the scene file; what they paint "
+        "white is a vertex `group`",
     )
     budget: int = Field(
         default=50_000, ge=100, le=5_000_000, description="Gaussians to aim for when a mesh is bound"

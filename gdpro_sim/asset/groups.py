@@ -1,0 +1,60 @@
+"""Named vertex groups of an imported mesh: one for each of its materials, and those painted as mask images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from gdpro_sim.asset.from_mesh import vertex_colors
+from gdpro_sim.asset.prims import to_numpy
+from gdpro_sim.binding import BoundGaussians
+from gdpro_sim.errors import MeshError
+from gdpro_sim.meshing.load import load_mesh
+from gdpro_sim.meshing.proximity import SurfaceIndex
+from gdpro_sim.meshing.surface import SurfaceMesh
+
+MOST = 64
+"""More materials than this are no groups that anybody would name."""
+
+
+def material_groups(mesh: SurfaceMesh, bound: BoundGaussians) -> dict[str, np.ndarray]:
+    """Vertices of `bound` by the names of the mesh's materials, where it has several; ascending int32 ids.
+
+    Vertices on a border belong to both sides. Materials of one name are one group.
+    """
+    names = [material.name for material in mesh.materials]
+    if not 1 < len(set(names)) <= MOST:
+        return {}
+    vertices, faces = to_numpy(bound.vertices), to_numpy(bound.faces)
+    nearest, _ = SurfaceIndex(mesh.vertices, mesh.faces).closest(vertices[faces].mean(axis=1))
+    owners = np.array(names)[mesh.material_ids[nearest]]
+    groups = {
+        name: np.unique(faces[owners == name]).astype(np.int32) for name in dict.fromkeys(names) if name
+    }
+    return {name: ids for name, ids in groups.items() if len(ids)}
+
+
+def mask_groups(
+    path: Path, masks: Mapping[str, str | Path], bound: BoundGaussians, *, up: str, scale: float | None
+) -> dict[str, np.ndarray]:
+    """Vertices of `bound` that mask images over the UV map of the mesh file `path` paint white, by name.
+
+    up, scale: as the mesh was read. Raises MeshError for a mesh without UV coordinates, an image that cannot
+    be read, and one that paints no vertex.
+    """
+    groups = {}
+    for name, mask in masks.items():
+        values = vertex_colors(load_mesh(path, texture=mask, up=up, scale=scale), bound).mean(axis=1)
+        ids = np.flatnonzero(values >= 0.5).astype(np.int32)
+        if not len(ids):
+            raise MeshError(
+                f"group {name!r}: {mask} paints no vertex of {path.name}: white belongs to the group, and the "
+                f"brightest vertex is {values.max():.2g} of it"
+            )
+        groups[name] = ids
+    return groups
+
+
+__all__ = ["mask_groups", "material_groups"]
