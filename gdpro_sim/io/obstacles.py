@@ -19,6 +19,9 @@ COLOR = (0.60, 0.63, 0.67)
 BUDGET = 12_000
 """Gaussians of each obstacle."""
 
+PART = 4_000
+"""Of each part of a base, which has many."""
+
 PLATE = 1.2
 """Half the width of the square that stands for a plane, as a multiple of the size of what is shown."""
 
@@ -40,10 +43,11 @@ class Obstacles:
         for number, collider in enumerate(colliders):
             if not collider.visible:
                 continue
-            vertices, faces = _surface(collider, low, high)
+            vertices, faces = surface_of(collider, low, high)
             placed = vertices @ collider.rotation.T + collider.position
-            mesh = SurfaceMesh.from_arrays(placed, faces, color=COLOR)
-            bound = bind_mesh(mesh, budget=max(BUDGET, 2 * len(faces)), occlusion=0.0).to(device)
+            mesh = SurfaceMesh.from_arrays(placed, faces, color=collider.color or COLOR)
+            budget = BUDGET if collider.color is None else PART
+            bound = bind_mesh(mesh, budget=max(budget, 2 * len(faces)), occlusion=0.0).to(device)
             self._items.append((number, collider, bound))
 
     @property
@@ -86,7 +90,7 @@ def with_obstacles(
     for collider in colliders:
         if collider.kind == "plane" or not collider.visible:
             continue
-        points = _surface(collider, low, high)[0] @ collider.rotation.T + collider.position
+        points = surface_of(collider, low, high)[0] @ collider.rotation.T + collider.position
         if np.linalg.norm(np.ptp(points, axis=0)) > LARGE * size:
             continue
         for time in collider.motion.sampled(duration) if isinstance(collider.motion, Motion) else (0.0,):
@@ -98,7 +102,7 @@ def with_obstacles(
     return np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
 
 
-def _surface(collider: Collider, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def surface_of(collider: Collider, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] m in the collider's own frame, and faces [F, 3], outward."""
     if collider.vertices is not None and collider.faces is not None:
         return collider.vertices, collider.faces
@@ -125,4 +129,4 @@ def _surface(collider: Collider, low: np.ndarray, high: np.ndarray) -> tuple[np.
     return np.asarray(shape.vertices), np.asarray(shape.faces, np.int32)
 
 
-__all__ = ["Obstacles", "with_obstacles"]
+__all__ = ["COLOR", "Obstacles", "surface_of", "with_obstacles"]

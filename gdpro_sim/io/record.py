@@ -147,7 +147,7 @@ def record(
     cameras = named_cameras(checked.camera, checked.cameras)
     staging = Staging(cameras, checked.lights, low, high, times, bodies, studio)
     preview = {"low": low.tolist(), "high": high.tolist(), "studio": asdict(staging.studio)}
-    obstacles = Obstacles(simulation.model.colliders, low, high, device)
+    obstacles = Obstacles(simulation.obstacles, low, high, device)
     scenery = Scenery([bound for _, bound in bodies], obstacles, staging.studio, device)
     rows = _run(simulation, folder, store, staging, scenery, preview, report)
 
@@ -206,6 +206,7 @@ def _run(
         },
         gravity=scene.gravity,
         ground=None if scene.ground is None else scene.ground.height,
+        links=simulation.obstacles[len(simulation.model.colliders) :],
     ) as writer:
         for index in range(total):
             stored = store.load(index)
@@ -324,7 +325,7 @@ def reach(scene: Scene, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]
         if placed.patches is not None:
             boxes.append(_spread(boxes[-1], simulation.model.mpm.domain))
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    low, high = with_obstacles(simulation.model.colliders, low, high, scene.duration)
+    low, high = with_obstacles(simulation.obstacles, low, high, scene.duration)
     if scene.ground is not None:
         low[2] = min(low[2], scene.ground.height)
         spread_out = 0.12 * (high[:2] - low[:2])

@@ -6,6 +6,7 @@
             Splats         ParticleField3DGaussianSplat: positions, orientations, scales, extent per frame
             Points         the same Gaussians for programs that drop splats (Blender)
             Tets           rest tetrahedra, with PhysicsMaterial
+        /Base              see `gdpro_sim.io.usd_links`
         Cameras, Lights    how the scene is seen, see `gdpro_sim.io.usd_views`
 
 Positions are the solver's float32 values in world space. Colours, opacities, topology and the binding are
@@ -32,9 +33,11 @@ from gdpro_sim.errors import AssetError, OutputError, RequestError
 from gdpro_sim.files import check_writable, commit_file, output_error, remove_quietly, temporary_beside
 from gdpro_sim.gaussians import Gaussians, sh_to_rgb
 from gdpro_sim.io.staging import Shot
+from gdpro_sim.io.usd_links import BASE, define_links, read_links, set_links
 from gdpro_sim.io.usd_views import ViewPrims
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
+from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.frame import BodyFrame, Frame
 from gdpro_sim.simulation.model import Body, Diagnostics, Model
 
@@ -95,6 +98,7 @@ class SimulationWriter:
     bodies:     in frame order; a compiled `Body` stands for its bare binding, `body_records` gives all
     gravity:    m/s^2, for other physics programs; None leaves it out
     ground:     height of the floor in m, for other physics programs; None leaves it out
+    links:      parts of a base; frames hold their poses after those of other colliders
 
     Raises RequestError where the path cannot be written, OutputError where writing fails.
     """
@@ -110,6 +114,7 @@ class SimulationWriter:
         metadata: dict[str, Any] | None = None,
         gravity: Sequence[float] | None = None,
         ground: float | None = None,
+        links: Sequence[Collider] = (),
     ) -> None:
         stage.check_suffix(path)
         if precision not in get_args(Precision):
@@ -129,6 +134,8 @@ class SimulationWriter:
         self._animate_sh = animate_sh
         self._gravity = gravity
         self._ground = ground
+        self._links = tuple(links)
+        self._ops: list[Any] = []
         self._fps = float(fps)
         self._metadata = json.dumps(metadata or {}, allow_nan=False)
         self._prims: list[tuple[Usd.Prim, SplatPrims]] = []
@@ -210,7 +217,8 @@ class SimulationWriter:
             root.CreateAttribute("gdpro:colliders", prims.T.DoubleArray, True)
         for figure in fields(Diagnostics):
             root.CreateAttribute(_FIGURES + figure.name, _FIGURE_TYPES[str(figure.type)][0], True)
-        taken: set[str] = set()
+        taken = {BASE}
+        self._ops = define_links(self._stage, root.GetPath(), self._links)
         paths = []
         for record, body, sample in zip(self._records, frame.bodies, samples, strict=True):
             path = root.GetPath().AppendChild(_identifier(record.name, taken))
@@ -269,6 +277,8 @@ class SimulationWriter:
         root.GetAttribute("gdpro:time").Set(float(frame.time), code)
         if frame.colliders is not None:
             root.GetAttribute("gdpro:colliders").Set(Vt.DoubleArray.FromNumpy(frame.colliders.ravel()), code)
+        if self._ops and frame.colliders is not None:
+            set_links(self._ops, frame.colliders[-len(self._ops) :], code)
         for figure in fields(Diagnostics):
             to_usd = _FIGURE_TYPES[str(figure.type)][1]
             root.GetAttribute(_FIGURES + figure.name).Set(
@@ -332,7 +342,7 @@ class SimulationWriter:
 
     def _release(self) -> None:
         self._open = False
-        self._prims = []
+        self._prims, self._ops = [], []
         self._views = None
         del self._stage, self._layer
 
@@ -356,7 +366,7 @@ class _Guard:
             return
         writer = self._writer
         writer._open = False
-        writer._prims = []
+        writer._prims, writer._ops = [], []
         writer._views = None
         writer.__dict__.pop("_stage", None)
         writer.__dict__.pop("_layer", None)
@@ -397,6 +407,7 @@ class SimulationReader:
     fps:      frames per second
     times:    seconds of each frame
     bodies:   the `BodyRecord` of each body (binding, faces, colours, rest tets, material)
+    links:    parts of a base as they are at the start
     metadata: as given to the writer
 
     Raises AssetError for a missing, corrupt or foreign file.
@@ -419,6 +430,7 @@ class SimulationReader:
             self.metadata: dict[str, Any] = metadata
             self._paths = [Sdf.Path(p) for p in self._root.GetAttribute("gdpro:bodies").Get() or []]
             self.bodies = tuple(self._body(p) for p in self._paths)
+            self.links = read_links(self._stage, self._root.GetPath())
 
     def __len__(self) -> int:
         return len(self._codes)

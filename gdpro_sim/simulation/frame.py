@@ -29,8 +29,8 @@ class Frame:
 
     index: frame number from 0; time code of the USD samples
     time:  seconds since the start
-    colliders: [C, 3, 4] float64, rotation and shift m of each of the scene's colliders since the start; None
-           where all of them are where their keyframes have them
+    colliders: [C, 3, 4] float64, rotation and shift m of each of `Simulation.obstacles` since the start: the
+           scene's colliders, and the parts of a base; None where all are where their keyframes have them
     """
 
     index: int

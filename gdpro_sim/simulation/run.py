@@ -12,6 +12,7 @@ import torch
 from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device
 from gdpro_sim.simulation.callbacks import with_code
+from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.compile import compile_scene, load_assets
 from gdpro_sim.simulation.conditions import Motion, pose_at
 from gdpro_sim.simulation.frame import BodyFrame, Frame
@@ -55,8 +56,20 @@ class Simulation:
         """Deformed surface vertices of every body, [V, 3] float32 m."""
         return [self.solver.surface_positions(i) for i in range(len(self.model.bodies))]
 
+    @property
+    def obstacles(self) -> tuple[Collider, ...]:
+        """What pictures show besides the bodies: the scene's colliders, then the parts of a base."""
+        return (*self.model.colliders, *getattr(self.solver, "links", ()))
+
     def colliders(self) -> np.ndarray | None:
-        """Where colliders are that move freely or by a function, see `Frame.colliders`."""
+        """Where `obstacles` are that move freely, by a function or as parts of a base: `Frame.colliders`."""
+        links = getattr(self.solver, "links", ())
+        if links:
+            still = np.eye(3), np.zeros(3)
+            moved = [item.motion for item in self.model.colliders]
+            own = [still if motion is None else pose_at(motion, self._time) for motion in moved]
+            poses = [np.column_stack(pose) for pose in own]
+            return np.stack([*poses, *self.solver.link_poses()])  # type: ignore[attr-defined]
         if self.model.particles is None or all(item.mass is None for item in self.model.colliders):
             motions = [item.motion for item in self.model.colliders]
             if not any(isinstance(motion, Motion) and motion.function for motion in motions):

@@ -19,6 +19,7 @@ from gdpro_sim.simulation.model import Diagnostics, Model
 from gdpro_sim.simulation.mujoco import soft
 from gdpro_sim.simulation.mujoco.controls import called
 from gdpro_sim.simulation.mujoco.energy import elastic_energy, volume_ratios
+from gdpro_sim.simulation.mujoco.links import link_of, poses_since, visible_geoms
 from gdpro_sim.simulation.mujoco.loads import Loads
 from gdpro_sim.simulation.mujoco.world import World, build, compile_spec
 from gdpro_sim.simulation.mujoco_model import RigidBody, SoftBody
@@ -61,6 +62,8 @@ class SolverMuJoCo:
                      None; called before every step of MuJoCo, after the keyframes. What it depends on besides
                      is not part of the state
     renamed:         (our name, the name taken) of bodies whose names a base had already
+    flexes:          MuJoCo's number of every soft body's flex, by number of the body
+    links:           what a base looks like at the start: its visible geoms
     counted:         [nbody] bool, bodies that diagnostics count: not the obstacles that are moved
     wrenches:        [nbody, 6] N and N m about the centre of mass, world axes: they push bodies in every step
                      until they are changed, and are no part of the state
@@ -79,7 +82,7 @@ class SolverMuJoCo:
         self.mjmodel = compile_spec(self.world.spec, str(model.mujoco.base or "the scene"))
         self.mjdata = mujoco.MjData(self.mjmodel)
         self._view = mujoco.MjData(self.mjmodel)
-        self._flexes = {
+        self.flexes = {
             i: mujoco.mj_name2id(self.mjmodel, mujoco.mjtObj.mjOBJ_FLEX, name)
             for i, (name, points) in enumerate(zip(self.world.names, self.world.points, strict=True))
             if points is not None
@@ -96,6 +99,11 @@ class SolverMuJoCo:
             log.info("springs ask for steps of %.2g s at most", self._timestep)
         self._count = _Count()
         self.reset()
+        shown = visible_geoms(self.mjmodel, self.world.geoms, floor=model.ground is None)
+        self._shown = shown if model.mujoco.base is not None else shown[:0]
+        self.links = tuple(link_of(self.mjmodel, self._view, geom) for geom in self._shown.tolist())
+        turns = self._view.geom_xmat[self._shown].reshape(-1, 3, 3)
+        self._linked = turns.copy(), self._view.geom_xpos[self._shown].copy()
 
     # ---- Solver ----
 
@@ -198,7 +206,7 @@ class SolverMuJoCo:
         turning = (np.cross(positions, linear) * mass[:, None] + spin).sum(axis=0)
         gravity = -float(mass @ (positions @ np.asarray(self.model.gravity)))
         elastic, ratio = 0.0, 1.0
-        for i in self._flexes:
+        for i in self.flexes:
             body = self.bodies[i]
             assert isinstance(body, SoftBody)
             moved = self.vertices(i)
@@ -238,6 +246,20 @@ class SolverMuJoCo:
         """MuJoCo's own steps in a `step(dt)`."""
         return max(1, math.ceil(dt / self._timestep - 1e-9))
 
+    @property
+    def open_loop(self) -> bool:
+        """Whether nothing but keyframes of actuators acts between steps."""
+        return not (self._driven or self._loads or self.callback is not None or self.wrenches.any())
+
+    def forward(self) -> mujoco.MjData:
+        """The state as it is with forces, sensors and contacts computed; to look at."""
+        mujoco.mj_forward(self.mjmodel, self._view)
+        return self._view
+
+    def link_poses(self) -> np.ndarray:
+        """[L, 3, 4] rotation and shift m of every of `links` since the start."""
+        return poses_since(self._view, self._shown, self._linked)
+
     def frames(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [B, 3, 3] and centres of mass [B, 3] m of MuJoCo's own bodies by their `numbers` [B]."""
         turns = self._view.xmat[numbers].reshape(-1, 3, 3)
@@ -245,7 +267,7 @@ class SolverMuJoCo:
 
     def vertices(self, body: int) -> np.ndarray:
         """Positions [P, 3] float64 m of a soft body's vertices."""
-        flex = self._flexes[body]
+        flex = self.flexes[body]
         begin, count = self.mjmodel.flex_vertadr[flex], self.mjmodel.flex_vertnum[flex]
         return soft.flex_vertices(self._view, begin, count)
 

@@ -12,11 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from gdpro_sim.simulation.conditions import Pose
 from gdpro_sim.simulation.mujoco import soft
+from gdpro_sim.simulation.mujoco.links import visible_geoms
 from gdpro_sim.simulation.mujoco.solver import SolverMuJoCo
 from gdpro_sim.simulation.mujoco_model import RigidBody, SoftBody
 
 BACKGROUND, FLOOR = 0, 1
 """Labels of what is no thing."""
+
+WORLD = "world"
+"""Name of what of a base does not move."""
 
 Kind = Literal["rigid", "soft", "obstacle", "link"]
 
@@ -33,10 +37,11 @@ class Thing:
 class Layout:
     """Which things, joints, actuators and sensors a solver's trajectories have. The same for a whole dataset.
 
-    things:  by ascending label, from `FLOOR` + 1
+    things:  by ascending label, from `FLOOR` + 1; the last stands for all of a base that does not move
     posed:   those of them that have a pose: all but soft bodies and obstacles that stand still
     joints:  (name, kind, first and number of columns of `qpos`, first and number of columns of `qvel`)
     sensors: (name, first and number of columns of `sensors`)
+    geom_labels, obstacle_labels: of MuJoCo's geoms, and of what `Simulation.obstacles` lists
     """
 
     def __init__(self, solver: SolverMuJoCo) -> None:
@@ -62,8 +67,13 @@ class Layout:
         for number in range(1, model.nbody):
             if number not in self.body_labels and number not in points:
                 add(model.body(number).name or f"body {number}", "link", number)
+        own = solver.world.geoms
+        scenery = [
+            k for k in range(model.ngeom) if not model.geom_bodyid[k] and model.geom(k).name not in own
+        ]
+        if scenery:
+            add(WORLD, "link", 0)
         self.things = tuple(things)
-        self.first_obstacle = len(solver.bodies)
         self.geom_labels = _geom_labels(solver, self)
         self.joints, self.columns = _joints(solver, points)
         self.sensors = tuple(
@@ -71,10 +81,7 @@ class Layout:
             for k in range(model.nsensor)
         )
         self.actuators = tuple(model.actuator(k).name for k in range(model.nu))
-
-    def link_label(self, name: str) -> int:
-        """Label of a base's body."""
-        return next(thing.label for thing in self.things if thing.kind == "link" and thing.name == name)
+        self.obstacle_labels = _obstacle_labels(solver, self)
 
 
 class Trajectory:
@@ -172,26 +179,26 @@ def _points(solver: SolverMuJoCo) -> set[int]:
 
 
 def _geom_labels(solver: SolverMuJoCo, layout: Layout) -> np.ndarray:
-    """[ngeom]: of geoms of moving bodies theirs; of the world's, by the names of obstacles."""
-    model = solver.mjmodel
-    labels = np.full(model.ngeom, BACKGROUND, np.int32)
-    obstacles = [thing for thing in layout.things if thing.kind == "obstacle"]
-    names = [model.geom(k).name for k in range(model.ngeom)]
-    for k in range(model.ngeom):
-        number = int(model.geom_bodyid[k])
-        if number:
-            labels[k] = layout.body_labels.get(int(number), BACKGROUND)
-        elif solver.model.ground is not None and names[k].split("-")[0] == "ground":
+    """[ngeom]: of the thing that a geom belongs to, `FLOOR` of the ground."""
+    model, own = solver.mjmodel, solver.world.geoms
+    labels = np.array([layout.body_labels.get(int(k), layout.things[-1].label) for k in model.geom_bodyid])
+    for k in np.flatnonzero(model.geom_bodyid == 0).tolist():
+        if model.geom(k).name in own:
             labels[k] = FLOOR
-    for thing, title in zip(obstacles, solver.world.obstacles, strict=True):
-        if not title:
-            titles = [
-                n for n in names if n == thing.name or n.startswith((f"{thing.name}_", f"{thing.name}-"))
-            ]
-            free = [n for n in titles if labels[names.index(n)] == BACKGROUND]
-            for name in free if len(free) < 2 or "_" in free[0] else free[:1]:
-                labels[names.index(name)] = thing.label
-    return labels
+    obstacles = (thing for thing in layout.things if thing.kind == "obstacle")
+    for thing, names in zip(obstacles, solver.world.obstacle_geoms, strict=True):
+        for name in names:
+            labels[model.geom(name).id] = thing.label
+    return labels.astype(np.int32)
+
+
+def _obstacle_labels(solver: SolverMuJoCo, layout: Layout) -> tuple[int, ...]:
+    """Of what `Simulation.obstacles` lists: colliders, then visible geoms of the base."""
+    labels = [thing.label for thing in layout.things if thing.kind == "obstacle"]
+    if solver.links:
+        shown = visible_geoms(solver.mjmodel, solver.world.geoms, floor=solver.model.ground is None)
+        labels += layout.geom_labels[shown].tolist()
+    return tuple(labels)
 
 
 def _joints(

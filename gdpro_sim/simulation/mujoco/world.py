@@ -39,6 +39,8 @@ class World:
     names:     of every body of `Model.bodies`, as the spec knows it
     points:    of every soft body, None for a rigid one
     obstacles: of every collider of `Model.colliders`: the body that is moved, "" where it stands
+    obstacle_geoms: of every collider: the names of its geoms
+    geoms:     names of all geoms that are not the base's
     renamed:   (our name, the name taken), where the base had ours already
     start:     (qpos, qvel, ctrl) of the base's keyframe that it starts from, or None
     """
@@ -49,6 +51,8 @@ class World:
     obstacles: tuple[str, ...]
     renamed: tuple[tuple[str, str], ...]
     start: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    obstacle_geoms: tuple[tuple[str, ...], ...] = ()
+    geoms: frozenset[str] = frozenset()
 
 
 def build(model: Model) -> World:
@@ -88,14 +92,26 @@ def build(model: Model) -> World:
     _pairs(spec, geoms)
     for a, b in world.welds:
         _weld(spec, names[a], names[b], step)
+    ours = [geom.name for _, shapes, _ in geoms for geom in shapes]
     if model.ground is not None:
         floor = spec.worldbody.add_geom(name=name("ground"), type=mujoco.mjtGeom.mjGEOM_PLANE)
         floor.pos, floor.size = [0.0, 0.0, model.ground.height], [0.0, 0.0, 1.0]
         _passive(floor, 0.0)
-    obstacles = []
-    for collider in model.colliders:
-        obstacles.append(_obstacle(spec, collider, name(collider.name), max(_weight(world), 1.0), geoms))
-    return World(spec, tuple(names), tuple(points), tuple(obstacles), tuple(renamed), start)
+        ours.append(floor.name)
+    made = [
+        _obstacle(spec, collider, name(collider.name), max(_weight(world), 1.0), geoms)
+        for collider in model.colliders
+    ]
+    return World(
+        spec,
+        tuple(names),
+        tuple(points),
+        tuple(moved for moved, _ in made),
+        tuple(renamed),
+        start,
+        tuple(own for _, own in made),
+        frozenset([*ours, *(geom for _, own in made for geom in own)]),
+    )
 
 
 def compile_spec(spec: mujoco.MjSpec, where: str = "the scene") -> mujoco.MjModel:
@@ -235,8 +251,8 @@ def _obstacle(
     title: str,
     weight: float,
     geoms: list[tuple[float, list[Any], tuple[float, float]]],
-) -> str:
-    """Geoms of an obstacle; returns the name of the body that moves it, "" where it stands still."""
+) -> tuple[str, tuple[str, ...]]:
+    """Geoms of an obstacle; returns the body that moves it, "" where it stands still, and their names."""
     parent, shift = spec.worldbody, collider.position
     if collider.motion is not None:
         parent = rigid.add_driven(spec, title, weight, max(*collider.size, 0.1))
@@ -265,7 +281,7 @@ def _obstacle(
             for shape in shapes:
                 for geom in made:
                     add_pair(spec, shape, geom, math.sqrt(friction * collider.friction), solref)
-    return title if collider.motion is not None else ""
+    return title if collider.motion is not None else "", tuple(geom.name for geom in made)
 
 
 def _terrain(spec: mujoco.MjSpec, parent: Any, collider: Collider, title: str) -> Any:
