@@ -1,4 +1,4 @@
-"""Problems with known answers: `gdpro verify fem`, `gdpro verify mpm`, `gdpro verify mujoco`."""
+"""Problems with known answers: `gdpro verify fem`, `gdpro verify mpm`, `mujoco` and `coupling`."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ QUANTITY_WIDTH = 68
 ABOUT = {
     "fem": "Elements, materials, beams, vibrations, energy, contact, friction, robustness of FEM.",
     "mpm": "Materials, transfers, momenta, vibration, impact, fluids, sand, friction, equal bytes of MPM.",
+    "coupling": "Momentum, rest, hinges, vibration, equal bytes of rigid bodies among soft ones.",
     "mujoco": "Inertia, friction, restitution, hinges, rest, flexes and exact states in MuJoCo.",
 }
 

@@ -26,6 +26,10 @@ log = logging.getLogger(__name__)
 
 PARTS: tuple[PartName, ...] = ("fem", "mpm", "mujoco")
 
+NEWTON_TOLERANCE = 1e-4
+"""m/s, of implicit soft bodies where the scene does not say: what they leave over a light rigid body feels
+times the ratio of masses."""
+
 Compile = Callable[[Scene, dict[str, Asset]], Model]
 
 
@@ -122,7 +126,10 @@ def _sub_scene(scene: Scene, options: CoupledOptions, part: PartName, chosen: li
     if isinstance(given, FemOptions | MpmOptions):
         # Theirs are per frame.
         steps = math.ceil(1.0 / (scene.fps * options.step) - 1e-9)
-        given = given.model_copy(update={"substeps": -(-given.substeps // steps)})
+        update: dict[str, float] = {"substeps": -(-given.substeps // steps)}
+        if "newton_tolerance" not in given.model_fields_set:
+            update["newton_tolerance"] = NEWTON_TOLERANCE
+        given = given.model_copy(update=update)
     forces = {} if part == "fem" else {"springs": (), "attachments": (), "wind": ()}
     return scene.model_copy(update={"bodies": bodies, "solver": given, **forces})
 

@@ -46,7 +46,9 @@ def base_links(rigid: Model) -> tuple[tuple[Link, ...], tuple[Collider, ...]]:
             still.append(collider)
         else:
             links.setdefault(body, []).append(collider)
-    return tuple(Link(body, of_base=True, colliders=tuple(made)) for body, made in links.items()), tuple(still)
+    return tuple(Link(body, of_base=True, colliders=tuple(made)) for body, made in links.items()), tuple(
+        still
+    )
 
 
 def _solid(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Collider:
@@ -71,9 +73,10 @@ def _solid(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Collider:
         mujoco.mjtGeom.mjGEOM_MESH: lambda: _hull(model, int(model.geom_dataid[geom]), common),
     }
     if kind not in shapes:
+        shape = kind.name.removeprefix("mjGEOM_").lower()
         raise SceneError(
-            f"the base's geom {name!r}: soft bodies cannot meet a {kind.name.removeprefix('mjGEOM_').lower()}; "
-            "let it touch nothing (contype and conaffinity 0), or make it of boxes or meshes"
+            f"the base's geom {name!r}: soft bodies cannot meet a {shape}; let it touch nothing (contype and "
+            "conaffinity 0), or make it of boxes or meshes"
         )
     try:
         return shapes[kind]()

@@ -89,12 +89,11 @@ class SolverCoupled:
         )
         self._gather = np.zeros((len(self._guides), len(guided)))
         self._gather[owners, np.arange(len(guided))] = 1.0
-        self._soft: list[SoftSolver] = []
+        self._soft: dict[PartName, SoftSolver] = {}
         for part in ("fem", "mpm"):
             if part in parts:
-                solver = _soft_solver(part, replace(parts[part], colliders=(*parts[part].colliders, *guided)))
-                self.solvers[part] = solver
-                self._soft.append(solver)
+                whole = replace(parts[part], colliders=(*parts[part].colliders, *guided))
+                self._soft[part] = self.solvers[part] = _soft_solver(part, whole)
         mass, inertia = (
             np.asarray(array)[self._numbers]
             for array in (self.rigid.mjmodel.body_mass, self.rigid.mjmodel.body_inertia)
@@ -102,6 +101,7 @@ class SolverCoupled:
         radius = np.sqrt(inertia.max(axis=1, initial=0.0) / np.maximum(mass, 1e-300))
         self._scale = np.repeat(np.stack([np.ones_like(radius), radius], axis=1), 3, axis=1)
         self._push = np.zeros((len(self._guides), 6))
+        self._impulses: dict[PartName, np.ndarray] = {}
         self._time = 0.0
         self._counters = _Counters()
         self.reset()
@@ -116,16 +116,26 @@ class SolverCoupled:
         """How often soft bodies were stepped in the last step, over the steps of the coupling."""
         return self._counters.rounds
 
+    def collider_impulses(self, part: PartName) -> np.ndarray:
+        """[C, 6] N s and N m s about the world's origin that bodies of "fem" or "mpm" gave in the last step.
+
+        To the colliders of that part's model, and then to those of the coupling's links; 0 before any step, and
+        for those that no `Guide` moves.
+        """
+        impulses: np.ndarray = self._impulses.get(part, np.zeros_like(self._soft[part].collider_impulses()))
+        return impulses
+
     # ---- Solver ----
 
     def reset(self) -> None:
         """Back to the model's initial state."""
         self.rigid.reset()
         self._push[:] = 0.0
+        self._impulses = {}
         self._time = 0.0
         self._counters = _Counters()
         self._stand()
-        for solver in self._soft:
+        for solver in self._soft.values():
             solver.reset()
 
     def step(self, dt: float) -> None:
@@ -137,14 +147,15 @@ class SolverCoupled:
             raise SolverError(f"step length must be a finite number > 0 s, got {dt}")
         before = self.state_dict()
         count = max(1, math.ceil(dt / self.coupling.step - 1e-9))
-        begin = self._time
-        self._counters = _Counters()
+        begin, impulses = self._time, self._impulses
+        self._counters, self._impulses = _Counters(), {}
         try:
             for k in range(count):
                 self._advance(dt / count)
                 self._time = begin + (k + 1) * dt / count
         except BaseException:  # Ctrl-C too: half a step is no state to continue from
             self.load_state_dict(before)
+            self._impulses = impulses
             raise
         if not self._counters.converged:
             log.warning(
@@ -179,9 +190,8 @@ class SolverCoupled:
             int(substeps), int(newton), int(cg), bool(converged), residual, int(rounds)
         )
         self._stand()
-        for part, solver in self.solvers.items():
-            if part != "mujoco":
-                solver.load_state_dict(_part_of(state, part))
+        for part, soft in self._soft.items():
+            soft.load_state_dict(_part_of(state, part))
 
     def diagnostics(self) -> Diagnostics:
         """Sums over the parts; converged where every part and their agreement did in every step.
@@ -207,7 +217,7 @@ class SolverCoupled:
 
     def _advance(self, h: float, splits: int = 0) -> None:
         """Step all parts by `h` seconds, in halves where they do not agree or soft bodies cannot follow."""
-        before = [solver.state_dict() for solver in (self.rigid, *self._soft)]
+        before = [solver.state_dict() for solver in self.solvers.values()]
         push, start = self._push, self._poses()
         try:
             residual = self._agree(h, start, before)
@@ -225,6 +235,8 @@ class SolverCoupled:
             self._advance(0.5 * h, splits + 1)
             return
         self._time += h
+        for part, soft in self._soft.items():
+            self._impulses[part] = self._impulses.get(part, 0.0) + soft.collider_impulses()
         c = self._counters
         c.converged &= agreed
         c.residual = max(c.residual, residual)
@@ -244,7 +256,7 @@ class SolverCoupled:
             if k > 0:
                 self._restore_soft(start, before)
             self._tell(start, self._moved(start, guess), h)
-            for solver in self._soft:
+            for solver in self._soft.values():
                 solver.step(h)
             self.rigid.load_state_dict(before[0])
             self._push = self._pushes(h, start, guess)
@@ -261,7 +273,7 @@ class SolverCoupled:
 
     def _restore_soft(self, start: list[Pose], before: list[dict[str, np.ndarray]]) -> None:
         self._tell(start, start)
-        for solver, state in zip(self._soft, before[1:], strict=True):
+        for solver, state in zip(self._soft.values(), before[1:], strict=True):
             solver.load_state_dict(state)
 
     def _move_rigid(self, h: float) -> None:
@@ -274,7 +286,7 @@ class SolverCoupled:
         MuJoCo adds a moment where the body is at the beginning of each of its own steps.
         """
         total = np.zeros((len(self._guides), 6))
-        for solver in self._soft:
+        for solver in self._soft.values():
             given = solver.collider_impulses()
             total += self._gather @ given[len(given) - self._gather.shape[1] :]
         count = self.rigid.substeps(h)

@@ -6,7 +6,7 @@ import importlib
 
 from gdpro_sim.simulation.verification.framework import Problem
 
-SOLVERS = ("fem", "mpm", "mujoco")
+SOLVERS = ("fem", "mpm", "mujoco", "coupling")
 """Solvers that have problems: one module of this package each, with a tuple PROBLEMS."""
 
 
