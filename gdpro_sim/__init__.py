@@ -30,6 +30,7 @@ _PUBLIC = {
     "rasterization": "gdpro_sim.splatting",
     "rasterization_2dgs": "gdpro_sim.splatting",
     "record": "gdpro_sim.io.record",
+    "rollout": "gdpro_sim.io.dataset",
     "simulate": "gdpro_sim.simulation.run",
 }
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from gdpro_sim.errors import GdproError
     from gdpro_sim.gaussians import Gaussians
     from gdpro_sim.io.animate import animate
+    from gdpro_sim.io.dataset import rollout
     from gdpro_sim.io.generate import generate
     from gdpro_sim.io.record import record
     from gdpro_sim.materials import Material
@@ -81,5 +83,6 @@ __all__ = [
     "rasterization",
     "rasterization_2dgs",
     "record",
+    "rollout",
     "simulate",
 ]

@@ -207,7 +207,9 @@ def _joints(
     """Joints of all but points of soft bodies, and their columns in MuJoCo's qpos and qvel."""
     model = solver.mjmodel
     sizes = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
-    joints, at, moving = [], [], []
+    joints: list[tuple[str, str, int, int, int, int]] = []
+    at: list[int] = []
+    moving: list[int] = []
     for k in range(model.njnt):
         if int(model.jnt_bodyid[k]) in points:
             continue
