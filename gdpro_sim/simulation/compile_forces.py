@@ -336,7 +336,7 @@ def tied(scene: Scene, bodies: Mapping[str, Faced]) -> Iterator[Tied]:
     named = members(scene.bodies)
     for k, ties in enumerate(scene.attachments):
         first, second = (named[name] for name in ties.bodies)
-        pairs = [(bodies[a], bodies[b]) for a in first for b in second]
+        pairs = [(bodies[a], bodies[b]) for a in first for b in second if a != b]
         found: list[Tied] = []
         for a, b in pairs:
             if len(pairs) > 1 and _gap(a, b) > _reach(ties, a):

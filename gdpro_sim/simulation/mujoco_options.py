@@ -143,9 +143,9 @@ class MujocoBody(Options):
 
     @model_validator(mode="after")
     def _belongs(self) -> MujocoBody:
-        # A recorded scene is read again with every default written out.
-        fields = type(self).model_fields
-        given = {key for key in self.model_fields_set if getattr(self, key) != fields[key].default}
+        given, fields = self.model_fields_set, type(self).model_fields
+        if given == set(fields):  # a recorded scene, which is read again with every default written out
+            given = {key for key in given if getattr(self, key) != fields[key].default}
         rigid = {"shape", "concavity", "joint", "anchor", "axis", "joint_damping", "limits", "restitution"}
         if self.form in ("full", "trilinear", "quadratic") and given & rigid:
             raise ValueError(f"`{min(given & rigid)}` belongs to a rigid body; this one is {self.form}")

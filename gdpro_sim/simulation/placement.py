@@ -6,12 +6,14 @@ import difflib
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import Asset
 from gdpro_sim.asset.compose import anchor_point
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
+from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.simulation.options import Vector, color_of
 from gdpro_sim.simulation.regions import Region
 from gdpro_sim.simulation.scene import Scene
@@ -102,7 +104,7 @@ class Placement:
 def place_bodies(scene: Scene, assets: dict[str, Asset]) -> list[Placement]:
     """Where each body's asset stands; copies share what a copy's colour does not change.
 
-    Raises SceneError for a body that starts below the ground.
+    Raises SceneError for a body that starts below the ground, and copies that overlap.
     """
     sized: dict[tuple[str, float | None, float], Asset] = {}
     placements = []
@@ -120,6 +122,7 @@ def place_bodies(scene: Scene, assets: dict[str, Asset]) -> list[Placement]:
                 vertex_colors=asset.vertex_colors,
             )
         placements.append(_placed(scene, body, scaled, colors))
+    _check_copies_apart(scene, placements)
     return placements
 
 
@@ -152,6 +155,31 @@ def _placed(scene: Scene, body: SceneBody, asset: Asset, colors: np.ndarray | No
 def material_of(body: SceneBody, asset: Asset) -> Material:
     """The scene's, else the asset's, else jelly."""
     return body.material or asset.material or Material.model_validate(FALLBACK_MATERIAL)
+
+
+def _check_copies_apart(scene: Scene, placements: list[Placement]) -> None:
+    """Raise SceneError for copies of one body of which one has vertices within the other."""
+    groups: dict[str, list[int]] = {}
+    for k, body in enumerate(scene.bodies):
+        if body.copied is not None and not placements[k].asset.gaussians.is_loose:
+            groups.setdefault(body.source, []).append(k)
+    for ids in groups.values():
+        low = np.array([placements[k].surface.min(axis=0) for k in ids])
+        high = np.array([placements[k].surface.max(axis=0) for k in ids])
+        reach = float(np.linalg.norm(high - low, axis=1).max())
+        faces = placements[ids[0]].asset.gaussians.faces.cpu().numpy()
+        for i, j in sorted(cKDTree(0.5 * (low + high)).query_pairs(reach)):
+            if (low[i] > high[j]).any() or (low[j] > high[i]).any():
+                continue
+            a, b = (placements[ids[n]].surface for n in (i, j))
+            for one, other in ((a, b), (b, a)):
+                near = other[((other > one.min(0)) & (other < one.max(0))).all(axis=1)]
+                if len(near) and SurfaceIndex(one, faces, winding=True).inside(near).any():
+                    names = " and ".join(repr(scene.bodies[ids[n]].name) for n in (i, j))
+                    raise SceneError(
+                        f"{scene.name}: copies {names} overlap at the start; raise `spacing`, lower "
+                        "`jitter`, or move their poses apart"
+                    )
 
 
 def _check_above_ground(scene: Scene, body: SceneBody, surface: np.ndarray) -> None:
