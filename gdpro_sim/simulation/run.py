@@ -63,26 +63,21 @@ class Simulation:
 
     def colliders(self) -> np.ndarray | None:
         """Where `obstacles` are that move freely, by a function or as parts of a base: `Frame.colliders`."""
-        links = getattr(self.solver, "links", ())
-        if links:
-            still = np.eye(3), np.zeros(3)
-            moved = [item.motion for item in self.model.colliders]
-            own = [still if motion is None else pose_at(motion, self._time) for motion in moved]
-            poses = [np.column_stack(pose) for pose in own]
-            return np.stack([*poses, *self.solver.link_poses()])  # type: ignore[attr-defined]
-        if self.model.particles is None or all(item.mass is None for item in self.model.colliders):
-            motions = [item.motion for item in self.model.colliders]
-            if not any(isinstance(motion, Motion) and motion.function for motion in motions):
-                return None
-            still = np.eye(3), np.zeros(3)
-            placed = [still if motion is None else pose_at(motion, self._time) for motion in motions]
-            return np.stack([np.column_stack(pose) for pose in placed])
-        from gdpro_sim.simulation.mpm import SolverMPM
-        from gdpro_sim.simulation.mpm.boundaries import collider_poses
+        if self.model.particles is not None and any(item.mass is not None for item in self.model.colliders):
+            from gdpro_sim.simulation.mpm import SolverMPM
+            from gdpro_sim.simulation.mpm.boundaries import collider_poses
 
-        assert isinstance(self.solver, SolverMPM)
-        poses = collider_poses(self.solver.boundaries, self.model, self.solver.time)
-        return np.stack([np.column_stack(pose) for pose in poses])
+            assert isinstance(self.solver, SolverMPM)
+            own = collider_poses(self.solver.boundaries, self.model, self.solver.time)
+            return np.stack([np.column_stack(pose) for pose in own])
+        links = getattr(self.solver, "links", ())
+        motions = [item.motion for item in self.model.colliders]
+        if not links and not any(isinstance(item, Motion) and item.function for item in motions):
+            return None
+        still = np.eye(3), np.zeros(3)
+        own = [still if motion is None else pose_at(motion, self._time) for motion in motions]
+        poses = [np.column_stack(pose) for pose in own]
+        return np.stack([*poses, *(self.solver.link_poses() if links else ())])  # type: ignore[attr-defined]
 
     def frame(
         self,
