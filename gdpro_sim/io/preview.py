@@ -52,15 +52,16 @@ class Studio:
 class Renderer:
     """Draws frames; what lies behind them is kept while a camera stands still.
 
-    cameras: any number; each is lit for its own side, unless the studio says otherwise
+    cameras: any number, to be named by their numbers; each is lit for its own side, unless the studio says
+             otherwise
     """
 
-    def __init__(self, cameras: Cameras, studio: Studio | None = None) -> None:
+    def __init__(self, cameras: Cameras | None = None, studio: Studio | None = None) -> None:
         self.studio = studio or Studio()
-        self.cameras = [
-            replace(cameras, viewmats=cameras.viewmats[i : i + 1], Ks=cameras.Ks[i : i + 1])
-            for i in range(len(cameras))
-        ]
+        self.cameras: list[Cameras] = []
+        if cameras is not None:
+            for view, k in zip(cameras.viewmats.split(1), cameras.Ks.split(1), strict=True):
+                self.cameras.append(replace(cameras, viewmats=view, Ks=k))
         self._backdrops: OrderedDict[tuple[bytes, int, int, str], Backdrop | None] = OrderedDict()
 
     def shadows(
@@ -204,7 +205,6 @@ def frame_camera(
     eye: Sequence[float] | np.ndarray | None = None,
     target: Sequence[float] | None = None,
     distance: float | None = None,
-    **_: object,
 ) -> Cameras:
     """One camera that sees the box `low`..`high` (m); angles in degrees.
 

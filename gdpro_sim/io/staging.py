@@ -77,7 +77,8 @@ class Staging:
             for name, camera in cameras.items()
             if camera.follow is not None
         }
-        self._lamps = [_Lamp(light) for light in lights]
+        self._own_lights = bool(lights)
+        self._lamps = [_Lamp(light) for light in lights or _studio_lights()]
         self._inside: set[tuple[str, str]] = set()
         self._next = 0
         if studio.azimuth is None:
@@ -100,9 +101,11 @@ class Staging:
             self._warn_inside(name, views[name], surfaces)
         self._next += 1
         assert self.studio.azimuth is not None
-        lamps = self._lamps or _studio_lamps()
-        states = tuple(lamp.at(time, self.studio.azimuth) for lamp in lamps)
-        return Shot(views, states, not self._lamps)
+        return Shot(views, self.lights_at(time, self.studio.azimuth), not self._own_lights)
+
+    def lights_at(self, time: float, azimuth: float) -> tuple[LightState, ...]:
+        """The lights at a time in s; azimuth: degrees, of the camera that some of them stand beside."""
+        return tuple(lamp.at(time, azimuth) for lamp in self._lamps)
 
     def _followed(self, camera: Camera) -> int:
         assert camera.follow is not None
@@ -177,9 +180,9 @@ class _Lamp:
         return LightState((x, y, z), intensity, self._color, light.softness)
 
 
-def _studio_lamps() -> list[_Lamp]:
+def _studio_lights() -> list[LightOptions]:
     """What stands for the studio's lights in other programs."""
-    return [_Lamp(TypeAdapter(LightOptions).validate_python(light)) for light in LIGHTS["studio"]]
+    return TypeAdapter(list[LightOptions]).validate_python(LIGHTS["studio"])
 
 
 class Scenery:
@@ -194,8 +197,7 @@ class Scenery:
         self._facing = Facing(bodies)
         self._obstacles = obstacles
         self._device = device
-        self._renderer: Renderer | None = None
-        self._studio = studio
+        self._renderer = Renderer(studio=studio)
 
     def draw(
         self, frame: Frame, shot: Shot, names: Sequence[str], passes: bool = False
@@ -208,8 +210,6 @@ class Scenery:
         drawn = {}
         for name in names:
             view = shot.cameras[name]
-            if self._renderer is None:
-                self._renderer = Renderer(view, self._studio)
             if shown is None or self._facing.turns:
                 normals = self._facing.normals([body.vertices for body in frame.bodies], view)
                 shown = self._obstacles.added_to(gaussians, normals, frame.time, frame.colliders)

@@ -1,6 +1,6 @@
 """Cameras and lights of a simulation file, for programs that show USD.
 
-    /Simulation/Cameras/main_cam   UsdGeom.Camera of the scene's `camera`, the one that usdview and usdrecord take
+    /Simulation/Cameras/main_cam   UsdGeom.Camera of the scene's `camera`; usdview and usdrecord look for it
     /Simulation/Cameras/<name>     of each of its `cameras`
     /Simulation/Lights/<kind>_<n>  UsdLux.DistantLight or UsdLux.DomeLight
 
