@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gdpro_sim.asset.from_mesh import vertex_colors
 from gdpro_sim.asset.prims import to_numpy
 from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.errors import MeshError
+from gdpro_sim.meshing.color import SurfaceColors
 from gdpro_sim.meshing.load import load_mesh
 from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.surface import SurfaceMesh
@@ -27,8 +27,8 @@ def material_groups(mesh: SurfaceMesh, bound: BoundGaussians) -> dict[str, np.nd
     names = [material.name for material in mesh.materials]
     if not 1 < len(set(names)) <= MOST:
         return {}
-    vertices, faces = to_numpy(bound.vertices), to_numpy(bound.faces)
-    nearest, _ = SurfaceIndex(mesh.vertices, mesh.faces).closest(vertices[faces].mean(axis=1))
+    faces = to_numpy(bound.faces)
+    nearest, _ = _centres(mesh, bound)
     owners = np.array(names)[mesh.material_ids[nearest]]
     groups = {
         name: np.unique(faces[owners == name]).astype(np.int32) for name in dict.fromkeys(names) if name
@@ -39,22 +39,29 @@ def material_groups(mesh: SurfaceMesh, bound: BoundGaussians) -> dict[str, np.nd
 def mask_groups(
     path: Path, masks: Mapping[str, str | Path], bound: BoundGaussians, *, up: str, scale: float | None
 ) -> dict[str, np.ndarray]:
-    """Vertices of `bound` that mask images over the UV map of the mesh file `path` paint white, by name.
+    """Vertices of `bound` on faces whose middle a mask image paints white, by name; ascending int32 ids.
 
-    up, scale: as the mesh was read. Raises MeshError for a mesh without UV coordinates, an image that cannot
-    be read, and one that paints no vertex.
+    The images lie over the UV map of the mesh file `path`. up, scale: as the mesh was read. Raises MeshError for a mesh without UV coordinates, an image that cannot
+    be read, and one that paints no face.
     """
     groups = {}
     for name, mask in masks.items():
-        values = vertex_colors(load_mesh(path, texture=mask, up=up, scale=scale), bound).mean(axis=1)
-        ids = np.flatnonzero(values >= 0.5).astype(np.int32)
+        mesh = load_mesh(path, texture=mask, up=up, scale=scale)
+        values = SurfaceColors(mesh).at(*_centres(mesh, bound))[:, :3].mean(axis=1)
+        ids = np.unique(to_numpy(bound.faces)[values >= 0.5]).astype(np.int32)
         if not len(ids):
             raise MeshError(
-                f"group {name!r}: {mask} paints no vertex of {path.name}: white belongs to the group, and the "
-                f"brightest vertex is {values.max():.2g} of it"
+                f"group {name!r}: {mask} paints no face of {path.name}: white belongs to the group, and the "
+                f"brightest face is {values.max():.2g} of it"
             )
         groups[name] = ids
     return groups
+
+
+def _centres(mesh: SurfaceMesh, bound: BoundGaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Where on `mesh` the middles of the faces of `bound` lie: face [F] and barycentric coordinates [F, 3]."""
+    middles = to_numpy(bound.vertices)[to_numpy(bound.faces)].mean(axis=1)
+    return SurfaceIndex(mesh.vertices, mesh.faces).closest(middles)
 
 
 __all__ = ["mask_groups", "material_groups"]
