@@ -37,6 +37,9 @@ def rollout(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Replace the dataset that the folder holds.")
     ] = False,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Run the Python files that the scene names.")
+    ] = False,
     json_output: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -70,6 +73,7 @@ def rollout(
             threads=threads,
             device=device,
             fresh=fresh,
+            allow_code=allow_code,
             on_progress=report,
         )
     if json_output:

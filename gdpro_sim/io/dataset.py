@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +29,7 @@ from gdpro_sim.errors import OutputError, RequestError, SceneError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
 from gdpro_sim.io.perception import CHANNELS, Photographer
 from gdpro_sim.io.record import fingerprint
+from gdpro_sim.simulation.callbacks import callbacks_of, with_code
 from gdpro_sim.simulation.compile import check_files, load_assets
 from gdpro_sim.simulation.effects import check_effects
 from gdpro_sim.simulation.mujoco.batch import run_batch
@@ -40,6 +42,8 @@ from gdpro_sim.simulation.randomize import Variations, draw, expand
 from gdpro_sim.simulation.run import Simulation
 from gdpro_sim.simulation.scene import Scene, check_scene, load_scene
 
+log = logging.getLogger(__name__)
+
 Progress = Callable[[str, int, int], None]
 """Called with (phase, done, total); total 0 means the length is not known."""
 
@@ -50,6 +54,9 @@ TOGETHER = 64
 
 MEMORY = 512 << 20
 """Bytes that they may take."""
+
+OVERLAP = 0.05
+"""Share of the smallest body's size that things may start inside each other without a warning."""
 
 ARRAYS = {
     "time": "[T] s",
@@ -123,6 +130,7 @@ def rollout(
     threads: int | None = None,
     device: str = "auto",
     fresh: bool = False,
+    allow_code: bool = False,
     on_progress: Progress | None = None,
 ) -> Dataset:
     """Run a MuJoCo scene `count` times with values drawn at random, and write a dataset into a folder.
@@ -133,6 +141,7 @@ def rollout(
     channels:  of every picture: rgb, depth, segmentation
     threads:   of MuJoCo and of the renderer; default: all
     fresh:     replace the dataset that the folder holds
+    allow_code: run the Python files that the scene names; what they give must depend on arguments alone
 
     A dataset of the same scene, seed and options is continued where it was stopped, and made longer where
     `count` is larger. Raises RequestError (also SceneError, MeshError, AssetError, DeviceError) before
@@ -155,6 +164,7 @@ def rollout(
     if frames and not channels:
         raise RequestError("give at least one channel, or `images` none")
     expand(checked, checked.randomize)
+    checked = with_code(checked, allow_code)
     check_files(checked)
     device = resolve_device(device)
     before, wanted = thread_count(), threads or thread_count()
@@ -212,6 +222,7 @@ def _make(
     records = [_read_json(_rollout_folder(folder, k) / "rollout.json") for k in range(count)]
     _write_table(folder, records)
     _write_json(folder / "dataset.json", {**about, "count": count, "complete": True})
+    _warn_overlap(records, simulation)
     steps = simulation.solver.substeps(1.0 / scene.fps)
     return Dataset(
         output=folder,
@@ -223,6 +234,17 @@ def _make(
         steps=steps * sum(max(0, records[k]["frames"] - 1) for k in missing),
         seconds={key: round(value, 3) for key, value in seconds.items()},
     )
+
+
+def _warn_overlap(records: list[dict[str, Any]], simulation: Simulation) -> None:
+    """Say once that things start inside each other: they fly apart."""
+    most = OVERLAP * min(float(np.ptp(body.surface, axis=0).max()) for body in simulation.model.bodies)
+    deep = [record["rollout"] for record in records if record["start_penetration"] > most]
+    if deep:
+        log.warning(
+            "%d of %d rollouts start with things more than %.2g m inside each other (first: %d; see "
+            "start_penetration): narrow the ranges of positions", len(deep), len(records), most, deep[0],
+        )  # fmt: skip
 
 
 # ---- the request ----
@@ -493,7 +515,9 @@ def _some(plan: _Plan, indices: list[int], seconds: dict[str, float]) -> Iterato
             surfaces[k][frame] = simulations[k].surfaces()
             poses_seen[k][frame] = simulations[k].colliders()
 
-    failures = run_batch(solvers, plan.scene.frame_count, 1.0 / plan.scene.fps, seen, threads=plan.threads)
+    # Functions of the user's are not asked from several threads.
+    threads = 1 if any(callbacks_of(plan.scene)) else plan.threads
+    failures = run_batch(solvers, plan.scene.frame_count, 1.0 / plan.scene.fps, seen, threads=threads)
     seconds["simulate"] += time.perf_counter() - begin
     for k, index in enumerate(indices):
         folder = prepare_folder(_rollout_folder(plan.folder, index), "rollout.json")

@@ -28,7 +28,7 @@ from gdpro_sim.splatting import rasterization
 
 CHANNELS = ("rgb", "depth", "segmentation")
 
-PROBES = 16
+PROBES = 8
 """Draws whose paths cameras without an eye are placed to see."""
 
 FINE, COARSE = 1e-4, 1e-3

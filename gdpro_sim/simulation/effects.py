@@ -27,24 +27,21 @@ def check_effects(
     Raises SceneError for a variation that changes nothing there, or has an end that the scene refuses.
     """
     for item in variations:
-        first, last = item.ends
-        where = f"randomize: {item.path}"
-        ends = []
-        for end in (first, last):
+        where, looks = f"randomize: {item.path}", item.path.split(".")[0] in LOOKS
+        ends: list[Model] = []
+        for end in item.ends:
             try:
                 changed, _ = put(scene, item, end)
-                ends.append((changed, compile_scene(changed, assets)))
+                if not looks:
+                    ends.append(compile_scene(changed, assets))
             except GdproError as error:
                 text = str(error).removeprefix(f"{where}: ")
                 raise SceneError(f"{where}: at {_shown(end)}: {text}") from None
-        if first == last:
-            continue
-        if item.path.split(".")[0] in LOOKS:
-            if not pictures:
-                raise SceneError(f"{where}: has no effect without images; give --images, or leave it out")
-            if _unseen(scene, item.path):
-                raise SceneError(f"{where}: has no effect where `eye` is given; draw `eye`, or leave it out")
-        elif _same(_constants(ends[0][1]), _constants(ends[1][1])):
+        if looks and not pictures:
+            raise SceneError(f"{where}: has no effect without images; give --images, or leave it out")
+        if looks and _unseen(scene, item.path):
+            raise SceneError(f"{where}: has no effect where `eye` is given; draw `eye`, or leave it out")
+        if ends and item.ends[0] != item.ends[1] and _same(_constants(ends[0]), _constants(ends[1])):
             raise SceneError(f"{where}: has no effect on this scene, which is the same at both ends")
 
 
