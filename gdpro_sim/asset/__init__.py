@@ -1,7 +1,7 @@
 """Assets: bound Gaussians with everything simulation needs, in one USD file."""
 
 from gdpro_sim.asset.asset import Asset
-from gdpro_sim.asset.compose import ComposedPart, compose
+from gdpro_sim.asset.composition import ComposedPart, compose
 from gdpro_sim.asset.importer import bind_asset, import_mesh, tetrahedralize_asset, versions
 from gdpro_sim.asset.stage import is_asset, kind
 

@@ -1,4 +1,4 @@
-"""Named vertex groups of an imported mesh: one for each of its materials, and those painted as mask images."""
+"""Named vertex groups of an imported mesh: one for each material, and those painted as mask images."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def material_groups(mesh: SurfaceMesh, bound: BoundGaussians) -> dict[str, np.nd
 def mask_groups(
     path: Path, masks: Mapping[str, str | Path], bound: BoundGaussians, *, up: str, scale: float | None
 ) -> dict[str, np.ndarray]:
-    """Vertices of `bound` on faces whose middle a mask image paints white, by name; ascending int32 ids.
+    """Vertices of `bound` on faces whose middles a mask image paints white, by name; ascending int32 ids.
 
-    The images lie over the UV map of the mesh file `path`. up, scale: as the mesh was read. Raises MeshError for a mesh without UV coordinates, an image that cannot
-    be read, and one that paints no face.
+    The images lie over the UV map of the mesh file `path`. up, scale: as the mesh was read. Raises MeshError
+    for a mesh without UV coordinates, an image that cannot be read, and one that paints no face.
     """
     groups = {}
     for name, mask in masks.items():
@@ -59,7 +59,7 @@ def mask_groups(
 
 
 def _centres(mesh: SurfaceMesh, bound: BoundGaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Where on `mesh` the middles of the faces of `bound` lie: face [F] and barycentric coordinates [F, 3]."""
+    """Where on `mesh` the middles of the faces of `bound` lie: face [F] and barycentric weights [F, 3]."""
     middles = to_numpy(bound.vertices)[to_numpy(bound.faces)].mean(axis=1)
     return SurfaceIndex(mesh.vertices, mesh.faces).closest(middles)
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import Asset
-from gdpro_sim.asset.compose import anchor_point
+from gdpro_sim.asset.composition import anchor_point
 from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.proximity import SurfaceIndex
