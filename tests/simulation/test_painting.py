@@ -99,10 +99,10 @@ OBJ = "mtllib two.mtl\n"
 
 
 def write_slab(folder: Path) -> Path:
-    """A slab on [-1, 1]^2, 0.4 thick: material `left` at x < 0, else `right`; (u, v) = (x + 1, y + 1) / 2."""
+    """A slab on [-1, 1]^2, 0.4 thick: material `left` at x < 0, else `right`; UV is about (x + 1, y + 1) / 2."""
     mesh = trimesh.creation.box((2, 2, 0.4)).subdivide().subdivide().subdivide()
     lines = [OBJ, *(f"v {x} {z} {-y}" for x, y, z in mesh.vertices)]
-    lines += [f"vt {(x + 1) / 2} {(y + 1) / 2}" for x, y, _ in mesh.vertices]
+    lines += [f"vt {0.5 + 0.48 * x} {0.5 + 0.48 * y}" for x, y, _ in mesh.vertices]
     left = mesh.triangles_center[:, 0] < 0
     for name, faces in (("left", mesh.faces[left]), ("right", mesh.faces[~left])):
         lines += [f"usemtl {name}", *("f " + " ".join(f"{i}/{i}" for i in face + 1) for face in faces)]
