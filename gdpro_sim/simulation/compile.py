@@ -24,7 +24,7 @@ from gdpro_sim.simulation.compile_animation import (
     moves_itself,
 )
 from gdpro_sim.simulation.compile_animation import check_supported as animation_supports
-from gdpro_sim.simulation.compile_coupled import as_part, compile_coupled, part_of
+from gdpro_sim.simulation.compile_coupled import as_part, compile_coupled, coupled_supports, part_of
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
 from gdpro_sim.simulation.compile_mpm import check_supported as mpm_supports
 from gdpro_sim.simulation.compile_mpm import compile_particles
@@ -151,6 +151,8 @@ def check_supported(scene: Scene) -> None:
         mpm_supports(scene)
     elif isinstance(scene.solver, MujocoOptions):
         mujoco_supports(scene)
+    elif isinstance(scene.solver, CoupledOptions):
+        coupled_supports(scene, scene.solver, check_supported)
     elif isinstance(scene.solver, AnimationOptions):
         animation_supports(scene)
     elif isinstance(scene.solver, FemOptions):

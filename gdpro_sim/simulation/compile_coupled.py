@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -65,40 +66,46 @@ def as_part(scene: Scene, body: SceneBody) -> SceneBody:
     return body.model_copy(update={"mujoco": own.model_copy(update={"form": "rigid"})})
 
 
+def coupled_supports(scene: Scene, options: CoupledOptions, check_part: Callable[[Scene], None]) -> None:
+    """Raise SceneError for what the parts cannot do, as far as the scene alone says it.
+
+    check_part: the same for a scene with one solver
+    """
+    known = [body for body in scene.bodies if body.solver != "auto" or body.mujoco or body.material]
+    named = {body.name: part_of(scene, body) for body in known}
+    _check_supported(scene, named)
+    for _, part_scene in _sub_scenes(scene, options, named):
+        check_part(part_scene)
+
+
 def compile_coupled(
     scene: Scene, options: CoupledOptions, assets: dict[str, Asset], compile_part: Compile
 ) -> Model:
     """A `Model` with the models of every part; `compile_part` makes the model of a scene with one solver.
 
-    Raises SceneError for what the parts cannot do, and forces that act on bodies of other parts.
+    Raises SceneError for what the parts cannot do, and forces between bodies of two of them.
     """
-    kinds = [part_of(scene, body, assets[body.name]) for body in scene.bodies]
-    named = {body.name: kind for body, kind in zip(scene.bodies, kinds, strict=True)}
-    _check_supported(scene, named)
-    parts: dict[PartName, Model] = {}
-    places: list[tuple[PartName, int]] = [("fem", 0)] * len(kinds)
-    for part in PARTS:
-        chosen = [k for k, kind in enumerate(kinds) if kind == part]
-        if chosen or part == "mujoco":
-            for number, k in enumerate(chosen):
-                places[k] = (part, number)
-            parts[part] = compile_part(_sub_scene(scene, options, part, chosen), assets)
-    _warn_apart(named)
     from gdpro_sim.simulation.coupled.base import base_links  # brings MuJoCo
 
+    named = {body.name: part_of(scene, body, assets[body.name]) for body in scene.bodies}
+    _check_supported(scene, named)
+    parts: dict[PartName, Model] = {
+        part: compile_part(part_scene, assets) for part, part_scene in _sub_scenes(scene, options, named)
+    }
+    _warn_apart(named)
     links, still = rigid_links(parts["mujoco"])
-    more, stands = base_links(parts["mujoco"])
-    links, still = (*links, *more), (*still, *stands)
+    of_base, stands = base_links(parts["mujoco"])
     for part in ("fem", "mpm"):
         if part in parts:
-            parts[part] = replace(parts[part], colliders=(*parts[part].colliders, *still))
-    return _joined(scene, Coupling(
-        parts, tuple(places), links, step=options.step, iterations=options.iterations,
-        tolerance=options.tolerance,
+            parts[part] = replace(parts[part], colliders=(*parts[part].colliders, *still, *stands))
+    numbers = {body.name: (part, k) for part in parts for k, body in enumerate(parts[part].bodies)}
+    return _joined(Coupling(
+        parts, tuple(numbers[body.name] for body in scene.bodies), (*links, *of_base), step=options.step,
+        iterations=options.iterations, tolerance=options.tolerance,
     ))  # fmt: skip
 
 
-def _joined(scene: Scene, coupling: Coupling) -> Model:
+def _joined(coupling: Coupling) -> Model:
     """The whole: arrays of every part, bodies in the scene's order."""
     parts = coupling.parts
     bodies: list[Body] = []
@@ -118,20 +125,46 @@ def _joined(scene: Scene, coupling: Coupling) -> Model:
     )
 
 
-def _sub_scene(scene: Scene, options: CoupledOptions, part: PartName, chosen: list[int]) -> Scene:
-    bodies = tuple(scene.bodies[k] for k in chosen)
-    if part == "mujoco":
-        bodies = tuple(as_part(scene, body) for body in bodies)
-    given = getattr(options, part)
-    if isinstance(given, FemOptions | MpmOptions):
-        # Theirs are per frame.
-        steps = math.ceil(1.0 / (scene.fps * options.step) - 1e-9)
-        update: dict[str, float] = {"substeps": -(-given.substeps // steps)}
-        if "newton_tolerance" not in given.model_fields_set:
-            update["newton_tolerance"] = NEWTON_TOLERANCE
-        given = given.model_copy(update=update)
-    forces = {} if part == "fem" else {"springs": (), "attachments": (), "wind": ()}
-    return scene.model_copy(update={"bodies": bodies, "solver": given, **forces})
+def _sub_scenes(
+    scene: Scene, options: CoupledOptions, named: dict[str, str]
+) -> Iterator[tuple[PartName, Scene]]:
+    """A scene with one solver for each part that has bodies, and for MuJoCo, whose base may have all."""
+    for part in PARTS:
+        bodies = tuple(body for body in scene.bodies if named.get(body.name) == part)
+        if part == "mujoco":
+            bodies = tuple(as_part(scene, body) for body in bodies)
+        elif not bodies:
+            continue
+        given = getattr(options, part)
+        if isinstance(given, FemOptions | MpmOptions):
+            # Theirs are per frame.
+            steps = math.ceil(1.0 / (scene.fps * options.step) - 1e-9)
+            update: dict[str, float] = {"substeps": -(-given.substeps // steps)}
+            if "newton_tolerance" not in given.model_fields_set:
+                update["newton_tolerance"] = NEWTON_TOLERANCE
+            given = given.model_copy(update=update)
+        yield (
+            part,
+            scene.model_copy(update={"bodies": bodies, "solver": given, **_forces(scene, named, part)}),
+        )
+
+
+def _forces(scene: Scene, named: dict[str, str], part: str) -> dict[str, Any]:
+    """Springs, attachments and wind on bodies of a part."""
+
+    def ours(names: Iterable[str | None]) -> bool:
+        return any(name is not None and named.get(name) == part for name in names)
+
+    winds = [
+        air if air.bodies is None
+        else air.model_copy(update={"bodies": tuple(name for name in air.bodies if named.get(name) == part)})
+        for air in scene.wind
+    ]  # fmt: skip
+    return {
+        "springs": tuple(item for item in scene.springs if ours(end.body for end in item.ends)),
+        "attachments": tuple(item for item in scene.attachments if ours(item.bodies)),
+        "wind": tuple(air for air in winds if air.bodies is None or air.bodies),
+    }
 
 
 # ---- rigid bodies as obstacles ----
@@ -183,7 +216,7 @@ def _meshed(body: RigidBody, vertices: np.ndarray, faces: np.ndarray, position: 
 def _check_supported(scene: Scene, named: dict[str, str]) -> None:
     """Raise SceneError for what no part can do with the bodies it has."""
     for body in scene.bodies:
-        if body.mujoco is not None and named[body.name] != "mujoco":
+        if body.mujoco is not None and named.get(body.name) != "mujoco":
             raise SceneError(
                 f"{scene.name}: bodies[{body.name}].mujoco: belongs to MuJoCo, but the body's solver is "
                 f"{named[body.name]}"
@@ -194,21 +227,22 @@ def _check_supported(scene: Scene, named: dict[str, str]) -> None:
                 f"{scene.name}: colliders[{k}].mass: in a coupled scene what moves freely is a body with "
                 "`solver: mujoco`"
             )
-    ours = [name for name, part in named.items() if part == "fem"]
-    used = [
-        *((f"springs[{k}]", end.body) for k, spring in enumerate(scene.springs) for end in spring.ends),
-        *((f"attachments[{k}]", name) for k, ties in enumerate(scene.attachments) for name in ties.bodies),
-        *(
-            (f"wind[{k}]", name)
-            for k, air in enumerate(scene.wind)
-            for name in (named if air.bodies is None else air.bodies)
-        ),
-    ]
-    for place, name in used:
-        if name is not None and named[name] != "fem":
+    ties = [(f"springs[{k}]", [end.body for end in spring.ends]) for k, spring in enumerate(scene.springs)]
+    ties += [(f"attachments[{k}]", list(tie.bodies)) for k, tie in enumerate(scene.attachments)]
+    for place, names in ties:
+        held = {name: named[name] for name in names if name in named}
+        if len(set(held.values())) > 1:
+            said = " and ".join(f"{name!r} ({part})" for name, part in held.items())
             raise SceneError(
-                f"{scene.name}: {place}: acts on bodies of FEM alone, but the solver of {name!r} is "
-                f"{named[name]}; FEM's are: {', '.join(ours) or 'none'}"
+                f"{scene.name}: {place}: holds bodies of two solvers together, {said}, which meet by contact "
+                "alone; give both the same `solver`"
+            )
+    for k, air in enumerate(scene.wind):
+        unmoved = [name for name, part in named.items() if part == "mpm"]
+        if air.bodies is None and unmoved:
+            raise SceneError(
+                f"{scene.name}: wind[{k}].bodies: name the bodies it blows on; MPM's know no wind: "
+                f"{', '.join(unmoved)}"
             )
 
 
@@ -222,4 +256,4 @@ def _warn_apart(named: dict[str, str]) -> None:
         )  # fmt: skip
 
 
-__all__ = ["as_part", "compile_coupled", "part_of", "rigid_links"]
+__all__ = ["as_part", "compile_coupled", "coupled_supports", "part_of", "rigid_links"]

@@ -81,7 +81,7 @@ class Scene(Options):
         default=(), description="bodies tied together where they meet"
     )
     randomize: tuple[Variation, ...] = Field(
-        default=(), description="what `gdpro rollout` draws anew for every rollout: paths and their ranges"
+        default=(), description="what `gdpro rollout` draws anew for every rollout: a mapping of paths to ranges"
     )
     folder: Path = Field(
         default_factory=Path.cwd, exclude=True, description="where relative paths start; set by load_scene"
@@ -206,7 +206,8 @@ class Scene(Options):
         if reference.startswith("package:"):
             package, _, inside = reference.removeprefix("package:").partition("/")
             try:
-                spec = importlib.util.find_spec(package) if package.isidentifier() else None
+                named = all(part.isidentifier() for part in package.split("."))
+                spec = importlib.util.find_spec(package) if named else None
             except (ImportError, ValueError):
                 spec = None
             if spec is None or not spec.submodule_search_locations:

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.errors import SolverError
+from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.conditions import Guide, Pose
 from gdpro_sim.simulation.coupled.quasi_newton import QuasiNewton
 from gdpro_sim.simulation.model import Coupling, Diagnostics, Model, PartName, Solver
@@ -60,7 +61,6 @@ class SolverCoupled:
     model:   with a `Coupling`
     solvers: of each part
     rigid:   MuJoCo's
-    links:   see `gdpro_sim.simulation.mujoco.SolverMuJoCo`
 
     Raises SceneError or SolverError where a part cannot simulate what it has.
     """
@@ -116,10 +116,19 @@ class SolverCoupled:
         """How often soft bodies were stepped in the last step, over the steps of the coupling."""
         return self._counters.rounds
 
+    @property
+    def links(self) -> tuple[Collider, ...]:
+        """What pictures show of MuJoCo's base."""
+        return self.rigid.links
+
+    def link_poses(self) -> np.ndarray:
+        """Where `links` are, [L, 3, 4]."""
+        return self.rigid.link_poses()
+
     def collider_impulses(self, part: PartName) -> np.ndarray:
         """[C, 6] N s and N m s about the world's origin that bodies of "fem" or "mpm" gave in the last step.
 
-        To the colliders of that part's model, and then to those of the coupling's links; 0 before any step, and
+        To the colliders of that part's model, and then to those of the links; 0 before any step, and
         for those that no `Guide` moves.
         """
         impulses: np.ndarray = self._impulses.get(part, np.zeros_like(self._soft[part].collider_impulses()))
