@@ -34,7 +34,7 @@ demo: $(READY)  ## generate a duck from words, drop it, print where the results 
 	$(VENV)/bin/gdpro simulate $(SCENE) -o $(OUT)
 
 test: $(DEV)  ## run all tests (slow ones included, the wheel test excepted)
-	$(VENV)/bin/python -m pytest -n 2 --dist loadfile -m "not wheel"
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -m "not wheel"
 
 lint: $(DEV)  ## check style and formatting
 	$(VENV)/bin/ruff check .

@@ -48,7 +48,7 @@ def test_every_noun_is_a_closed_standing_object_with_colours(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NOUNS)
 def test_every_variation_is_closed_and_nothing_hangs_in_the_air(name: str) -> None:
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         thing = build(parse(name), seed)
         surface = thing.surface(96)
         check(surface, name)
