@@ -183,7 +183,7 @@ def _check_copies_apart(scene: Scene, placements: list[Placement]) -> None:
 
 
 def _check_above_ground(scene: Scene, body: SceneBody, surface: np.ndarray) -> None:
-    if scene.ground is None:
+    if scene.ground is None or body.animation is not None:  # what moves by itself may rest elsewhere
         return
     low, extent = float(surface[:, 2].min()), float(np.ptp(surface[:, 2]))
     below = scene.ground.height - low
