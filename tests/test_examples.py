@@ -55,6 +55,13 @@ def test_fit_views(tmp_path: Path, kind: str) -> None:
     assert (tmp_path / "out/fit_views/fit.ply").stat().st_size > 300 * 50
 
 
+def test_read_dataset(tmp_path: Path) -> None:
+    lines = run("read_dataset.py", cwd=tmp_path).splitlines()
+    assert lines[0].startswith("4 rollouts of 16 frames; drawn: bodies.red.rotation")
+    heights = [float(line.split("and [")[1].split("]")[0].split()[2]) for line in lines if " points " in line]
+    assert len(heights) == 4 and all(0.05 < height < 0.4 for height in heights)
+
+
 @pytest.mark.slow
 def test_generate_by_stages(tmp_path: Path) -> None:
     small = [
