@@ -14,7 +14,7 @@ from gdpro_sim.io.preview import Studio, fitting_distance, frame_camera
 from gdpro_sim.io.tracks import Track
 from gdpro_sim.simulation.view import Camera, Orbit
 
-ROOM = 2.4
+ROOM = 1.8
 """A followed body gets a picture this many times its size."""
 
 SAMPLES = 240

@@ -62,7 +62,7 @@ class Renderer:
         if cameras is not None:
             for view, k in zip(cameras.viewmats.split(1), cameras.Ks.split(1), strict=True):
                 self.cameras.append(replace(cameras, viewmats=view, Ks=k))
-        self._backdrops: OrderedDict[tuple[bytes, int, int, str], Backdrop | None] = OrderedDict()
+        self._backdrops: OrderedDict[tuple[object, ...], Backdrop | None] = OrderedDict()
 
     def shadows(
         self, gaussians: Gaussians, camera: int | Cameras = 0, lights: Sequence[LightState] | None = None
@@ -85,12 +85,14 @@ class Renderer:
         normals: torch.Tensor,
         camera: int | Cameras = 0,
         maps: ShadowMaps | None = None,
+        focus: tuple[float, float, float] | None = None,
     ) -> np.ndarray:
         """One picture, uint8 [H, W, 3], or [H, W, 4] (not premultiplied) where the background is transparent.
 
         normals: [N, 3] unit, used by shading
         camera:  number of one of the renderer's cameras, or another one
         maps:    of `shadows`, where several cameras share it
+        focus:   [3] m, what the floor fades out around; default: the studio's
         """
         device = gaussians.means.device
         one = self._one(camera)
@@ -110,7 +112,7 @@ class Renderer:
             one.height,
             sh_degree=lit.sh_degree,
         )
-        behind, opacity = self._behind(one, device).picture(maps)
+        behind, opacity = self._behind(one, focus or self.studio.focus, device).picture(maps)
         picture = color[0] + (1.0 - alpha[0]) * behind.to(device)
         if opacity is not None:
             cover = alpha[0] + (1.0 - alpha[0]) * opacity.to(device)
@@ -147,13 +149,13 @@ class Renderer:
     def _one(self, camera: int | Cameras) -> Cameras:
         return camera if isinstance(camera, Cameras) else self.cameras[camera]
 
-    def _behind(self, camera: Cameras, device: torch.device) -> Backdrop:
+    def _behind(self, camera: Cameras, focus: tuple[float, float, float], device: torch.device) -> Backdrop:
         """A backdrop is kept when a camera is seen for the second time: one that moves never is."""
         matrices = camera.viewmats.numpy().tobytes() + camera.Ks.numpy().tobytes()
-        key = matrices, camera.width, camera.height, str(device)
+        key = matrices, camera.width, camera.height, focus, str(device)
         known = self._backdrops.get(key)
         if known is None:
-            known = backdrop(camera, self.studio, device)
+            known = backdrop(camera, replace(self.studio, focus=focus), device)
             self._backdrops[key] = known if key in self._backdrops else None
             if len(self._backdrops) > KEPT_BACKDROPS:
                 self._backdrops.popitem(last=False)

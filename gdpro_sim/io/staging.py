@@ -32,11 +32,13 @@ class Shot:
     """How one moment is seen.
 
     cameras: one view each, by name
+    focus:   [3] m, what a camera follows, by its name; the floor fades out around it
     lights:  as they are then
     studio:  whether they are the studio's own, which are drawn as they always were
     """
 
     cameras: dict[str, Cameras]
+    focus: dict[str, tuple[float, float, float]]
     lights: tuple[LightState, ...]
     studio: bool
 
@@ -88,12 +90,14 @@ class Staging:
     def next(self, surfaces: Sequence[np.ndarray]) -> Shot:
         """How the next frame is seen, whose bodies have their vertices [V, 3] m at `surfaces`."""
         time = float(self._times[self._next])
-        views = {}
+        views, focus = {}, {}
         for name, camera in self._cameras.items():
             middle = None
             if camera.follow is not None:
                 vertices = surfaces[self._followed(camera)]
                 middle = self._followers[name].next(vertices)
+                x, y, z = middle.tolist()
+                focus[name] = (x, y, z)
                 if self._next == 0:
                     low, high = vertices.min(axis=0).astype(float), vertices.max(axis=0).astype(float)
                     self._paths[name].follow(low, high)
@@ -101,7 +105,7 @@ class Staging:
             self._warn_inside(name, views[name], surfaces)
         self._next += 1
         assert self.studio.azimuth is not None
-        return Shot(views, self.lights_at(time, self.studio.azimuth), not self._own_lights)
+        return Shot(views, focus, self.lights_at(time, self.studio.azimuth), not self._own_lights)
 
     def lights_at(self, time: float, azimuth: float) -> tuple[LightState, ...]:
         """The lights at a time in s; azimuth: degrees, of the camera that some of them stand beside."""
@@ -215,7 +219,7 @@ class Scenery:
                 shown = self._obstacles.added_to(gaussians, normals, frame.time, frame.colliders)
             if maps is None:
                 maps = self._renderer.shadows(shown[0], view, lights)
-            picture = self._renderer.render(*shown, view, maps)
+            picture = self._renderer.render(*shown, view, maps, shot.focus.get(name))
             drawn[name] = picture, self._renderer.passes(*shown, view) if passes else {}
         return drawn
 

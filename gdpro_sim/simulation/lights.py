@@ -129,8 +129,8 @@ LIGHTS: dict[str, list[dict[str, Any]]] = {
         {"kind": "dome", "intensity": 0.26, "color": "#cfe2ff"},
     ],
     "sunset": [
-        _distant(-75.0, 16.0, 1.25, softness=2.0, color="#ffae66"),
-        {"kind": "dome", "intensity": 0.32, "color": "#a9b8ea"},
+        _distant(-75.0, 22.0, 1.7, softness=2.0, color="#ffc188"),
+        {"kind": "dome", "intensity": 0.42, "color": "#b3bfee"},
     ],
     "moonlight": [
         _distant(-110.0, 42.0, 0.34, softness=1.0, color="#b4c8ff"),
