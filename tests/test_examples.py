@@ -84,6 +84,14 @@ def test_generate_by_stages(tmp_path: Path) -> None:
         assert read_png(folder / f"{name}.png").std() > 10.0
 
 
+def test_swing(tmp_path: Path) -> None:
+    output = run("swing.py", cwd=tmp_path)
+    assert "the first cube has landed" in output and "cube_2" in output
+    pictures = sorted((tmp_path / "out/swing/frames").glob("*.png"))
+    assert len(pictures) == 8
+    assert np.abs(read_png(pictures[-1]).astype(float) - read_png(pictures[0])).max() > 50
+
+
 def test_every_example_is_tested() -> None:
     here = Path(__file__).read_text(encoding="utf-8")
     for script in EXAMPLES.glob("*.py"):

@@ -99,7 +99,7 @@ OBJ = "mtllib two.mtl\n"
 
 
 def write_slab(folder: Path) -> Path:
-    """A slab on [-1, 1]^2, 0.4 thick: material `left` at x < 0, else `right`; UV is about (x + 1, y + 1) / 2."""
+    """A slab on [-1, 1]^2, 0.4 thick: material `left` at x < 0, else `right`; UV from X and Y."""
     mesh = trimesh.creation.box((2, 2, 0.4)).subdivide().subdivide().subdivide()
     lines = [OBJ, *(f"v {x} {z} {-y}" for x, y, z in mesh.vertices)]
     lines += [f"vt {0.5 + 0.48 * x} {0.5 + 0.48 * y}" for x, y, _ in mesh.vertices]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import BaseModel
 
+from gdpro_sim.cli import main
 from gdpro_sim.errors import SceneError
 from gdpro_sim.generation import objects
 from gdpro_sim.materials import PRESETS, Material
@@ -250,3 +252,23 @@ def test_presets_are_physical(name: str) -> None:
 def test_presets_can_be_overridden() -> None:
     material = Material.model_validate({"preset": "rubber", "young": 2e6})
     assert material.young == 2e6 and material.density == PRESETS["rubber"]["density"]
+
+
+def test_the_reference_is_what_the_command_prints(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setattr("sys.argv", ["gdpro", "scenes", "--reference"])
+    with pytest.raises(SystemExit):
+        main()
+    printed = capsys.readouterr().out
+    for key in ("copies", "spacing", "callback", "painted", "friction", "young", "rest_length"):
+        assert f"| `{key}` |" in printed, key
+    assert "`copied`" not in printed and "`folder`" not in printed
+    stored = (Path(__file__).parents[2] / "docs/scenes.md").read_text(encoding="utf-8")
+    assert stored == printed, "run: gdpro scenes --reference > docs/scenes.md"
+
+
+def test_another_seed_draws_other_copies(tmp_path: Path) -> None:
+    path = tmp_path / "s.yaml"
+    path.write_text(MINIMAL + "    copies: {count: 2, spacing: 1, jitter: {position: 0.2}}\n")
+    one, two, again = (load_scene(path, seed=seed).bodies for seed in (1, 2, 1))
+    assert one == again and one != two
+    assert load_scene(path, seed=2).seed == 2
