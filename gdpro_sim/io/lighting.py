@@ -233,7 +233,7 @@ class ShadowMaps:
         self._lit: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
 
     def gather(self, points: torch.Tensor, normals: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Light of each group before its colour, and its visibility, [M, G]; points m, unit normals [M, 3]."""
+        """Light of each group before its colour, and its visibility, [M, G]; points m, unit normals."""
         device = points.device
         light = torch.empty((len(points), len(self._groups)), dtype=torch.float32, device=device)
         seen = torch.empty_like(light)

@@ -152,7 +152,7 @@ class Renderer:
     def _behind(self, camera: Cameras, focus: tuple[float, float, float], device: torch.device) -> Backdrop:
         """A backdrop is kept when a camera is seen for the second time: one that moves never is."""
         matrices = camera.viewmats.numpy().tobytes() + camera.Ks.numpy().tobytes()
-        key = matrices, camera.width, camera.height, focus, str(device)
+        key = matrices, camera.width, camera.height, tuple(focus), str(device)
         known = self._backdrops.get(key)
         if known is None:
             known = backdrop(camera, replace(self.studio, focus=focus), device)
