@@ -29,18 +29,16 @@ def write_exr(path: str | Path, image: np.ndarray) -> None:
     planes, layout = (image, "grayf32le")
     if image.ndim == 3:  # ffmpeg's order of planes
         planes, layout = np.moveaxis(image, -1, 0)[[1, 2, 0]], "gbrpf32le"
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", "-f", "rawvideo"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo"]
     command += ["-pix_fmt", layout, "-s", f"{width}x{height}", "-i", "-"]
-    command += ["-c:v", "exr", "-compression", "zip16", "-f", "image2", "-update", "1"]
+    command += ["-c:v", "exr", "-compression", "zip16", "-f", "image2pipe", "-"]
     with atomic_write(path) as temporary:
-        # A percent sign in the name would number the pictures.
-        target = str(temporary).replace("%", "%%")
-        done = subprocess.run(
-            [*command, target], input=np.ascontiguousarray(planes, "<f4").tobytes(), capture_output=True
-        )
+        pixels = np.ascontiguousarray(planes, "<f4").tobytes()
+        done = subprocess.run(command, input=pixels, capture_output=True)
         if done.returncode != 0:
             said = done.stderr.decode(errors="replace").strip().splitlines()
             raise OutputError(f"{path} cannot be written: {said[-1] if said else 'ffmpeg failed'}")
+        temporary.write_bytes(done.stdout)
 
 
 __all__ = ["PASSES", "check_passes", "write_exr"]
