@@ -37,6 +37,12 @@ def test_render_asset(tmp_path: Path) -> None:
     assert np.all(picture[:5] > 250)
 
 
+def test_compose_and_animate(tmp_path: Path) -> None:
+    output = run("compose_and_animate.py", str(tmp_path / "out"), cwd=tmp_path)
+    assert "ball_0, ball_1, ball_2, ball_3, ball_4" in output and "wrote 11 frames" in output
+    assert read_png(tmp_path / "out/crawl/contact_sheet.png").std() > 10.0
+
+
 def test_gsplat_import(tmp_path: Path) -> None:
     output = run("gsplat_import.py", cwd=tmp_path)
     losses = [float(line.split()[3]) for line in output.splitlines() if line.startswith("step")]

@@ -524,23 +524,23 @@ def test_any_vertex_source_can_move_an_asset(tmp_path: Path) -> None:
     class Swing:
         rest = z_up(tube()[0])
         faces = tube()[1].astype(np.int32)
-        fps, begin, end = 4.0, 0.0, 1.0
+        fps, begin, end = 4.0, 2.0, 3.0
 
         def vertices(self, time: float) -> np.ndarray:
-            return self.rest + np.array([0.0, time, 0.0])
+            return self.rest + np.array([0.0, time, 0.0])  # never at rest
 
     asset = animated(bending_tube(tmp_path / "tube.glb")).assets["it"]
     scene = animation_scene(asset, tmp_path / "out", motion=Swing())
     assert (scene.duration, scene.fps) == (1.0, 4)
     frames = list(Simulation(scene, load_assets(scene), device="cpu"))
     moved = frames[3].bodies[0].vertices - asset.gaussians.vertices.numpy()
-    assert np.allclose(moved, [0.0, 0.75, 0.0], atol=1e-6)
+    assert np.allclose(moved, [0.0, 2.75, 0.0], atol=1e-6)
     with pytest.raises(RequestError, match="an asset does not move by itself"):
         animation_scene(asset, tmp_path / "out")
     for wrong, message in (
         ({"loop": 0}, "loop must be >= 1"),
         ({"speed": -1.0}, "speed must be"),
-        ({"start": 0.5, "end": 9.0}, "which lasts from 0 to 1 s"),
+        ({"start": 2.5, "end": 9.0}, "which lasts from 2 to 3 s"),
         ({"motion": "none.glb"}, "none.glb: no such file or folder"),
     ):
         with pytest.raises(RequestError, match=message):

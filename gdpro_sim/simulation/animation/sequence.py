@@ -42,7 +42,7 @@ def read_folder(folder: Path, fps: float) -> Motion:
         points, polygons = (first, faces) if number == 0 else _topology(file)
         _check_same(file, files[0], points, first, polygons, faces)
         frames[number] = points
-    return _motion(folder, look, _triangles(files[0], first, faces), frames, fps)
+    return _motion(folder, look, _triangles(files[0], first, faces), frames, fps, rest=first, begin=0.0)
 
 
 def read_arrays(file: Path, fps: float | None) -> Motion:
@@ -76,9 +76,12 @@ def read_arrays(file: Path, fps: float | None) -> Motion:
     up = str(arrays["up"]) if "up" in arrays else "z"
     if up not in ("y", "z"):
         raise MeshError(f"{file}: up must be y or z, got {up!r}")
-    ids = np.zeros(len(faces), np.int32)
-    part = RawPart(frames[0].astype(np.float64), faces.astype(np.int64), ids, [material], None, colors)
-    return _motion(file, RawMesh([part], up=up), faces, frames, fps or own)
+    rest = np.asarray(arrays.get("rest", frames[0]), np.float64)
+    if rest.shape != frames.shape[1:]:
+        raise MeshError(f"{file}: rest must be {list(frames.shape[1:])}, got {list(rest.shape)}")
+    part = RawPart(rest, faces.astype(np.int64), np.zeros(len(faces), np.int32), [material], None, colors)
+    begin = float(arrays.get("begin", 0.0))
+    return _motion(file, RawMesh([part], up=up), faces, frames, fps or own, rest=rest, begin=begin)
 
 
 def _corner_colors(file: Path, colors: np.ndarray, count: int) -> np.ndarray:
@@ -90,7 +93,16 @@ def _corner_colors(file: Path, colors: np.ndarray, count: int) -> np.ndarray:
     return np.column_stack([colors, np.full(count, 255)]).astype(np.uint8)
 
 
-def _motion(path: Path, look: RawMesh, faces: np.ndarray, frames: np.ndarray, fps: float) -> Motion:
+def _motion(
+    path: Path,
+    look: RawMesh,
+    faces: np.ndarray,
+    frames: np.ndarray,
+    fps: float,
+    *,
+    rest: np.ndarray,
+    begin: float,
+) -> Motion:
     last = len(frames) - 1
     if last < 1:
         raise MeshError(f"{path}: one frame is no motion; give two at least")
@@ -101,7 +113,7 @@ def _motion(path: Path, look: RawMesh, faces: np.ndarray, frames: np.ndarray, fp
         )
 
     def pose(time: float) -> np.ndarray:
-        at = min(max(time * fps, 0.0), float(last))
+        at = min(max((time - begin) * fps, 0.0), float(last))
         if abs(at - round(at)) < 1e-6:  # a frame is itself, whatever rounding did to its time
             return frames[round(at)].astype(np.float64)
         before = min(int(at), last - 1)
@@ -109,7 +121,7 @@ def _motion(path: Path, look: RawMesh, faces: np.ndarray, frames: np.ndarray, fp
         a, b = (frames[k].astype(np.float64) for k in (before, before + 1))
         return (1.0 - share) * a + share * b
 
-    return Motion(path, look, faces, frames[0].astype(np.float64), pose, fps, 0.0, last / fps)
+    return Motion(path, look, faces, rest, pose, fps, begin, begin + last / fps)
 
 
 def _numbered(folder: Path) -> list[Path]:

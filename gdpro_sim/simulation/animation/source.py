@@ -108,9 +108,10 @@ def open_motion(
     clip: name or number of one of a glTF file's animations; default: the first
     up, scale: as in `gdpro_sim.meshing.load.load_mesh`
 
-    An .npz holds `vertices` [T, V, 3] and `faces` [F, 3], and may hold `colors` [V, 3] (sRGB, uint8 or floats
-    in [0, 1]), `fps` and `up` ("y" or "z"). glTF: skins, morph targets and moving nodes; USD: the same as
-    UsdSkel and transforms, and points with time samples.
+    An .npz holds `vertices` [T, V, 3] and `faces` [F, 3], and may hold `rest` [V, 3] (default: the first
+    frame), `colors` [V, 3] (sRGB, uint8 or floats in [0, 1]), `fps`, `begin` (s) and `up` ("y" or "z").
+    glTF: skins, morph targets and moving nodes; USD: the same as UsdSkel and transforms, and points with time
+    samples.
     Raises MeshError where the file cannot be read, holds no motion, or its topology changes.
     """
     file = Path(path)
@@ -159,7 +160,15 @@ def save_motion(path: str | Path, source: VertexSource) -> None:
         )
     frames = [source.vertices(source.begin + k / source.fps) for k in range(count)]
     with atomic_write(path) as temporary:
-        np.savez(temporary, vertices=np.stack(frames), faces=source.faces, fps=source.fps, up="z")
+        np.savez(
+            temporary,
+            vertices=np.stack(frames),
+            faces=source.faces,
+            rest=source.rest,
+            fps=source.fps,
+            begin=source.begin,
+            up="z",
+        )
 
 
 __all__ = ["Motion", "VertexSource", "open_motion", "save_motion"]
