@@ -15,6 +15,7 @@ from gdpro_sim.errors import MeshError, SceneError
 from gdpro_sim.meshing.repair import validate
 from gdpro_sim.simulation.colliders import Collider, mesh_collider, shape_collider
 from gdpro_sim.simulation.compile_mujoco import STIFF
+from gdpro_sim.simulation.copies import members
 from gdpro_sim.simulation.model import Body, Coupling, Link, Model, PartName
 from gdpro_sim.simulation.mujoco_model import RigidBody, Shape
 from gdpro_sim.simulation.mujoco_options import MujocoBody
@@ -229,8 +230,9 @@ def _check_supported(scene: Scene, named: dict[str, str]) -> None:
             )
     ties = [(f"springs[{k}]", [end.body for end in spring.ends]) for k, spring in enumerate(scene.springs)]
     ties += [(f"attachments[{k}]", list(tie.bodies)) for k, tie in enumerate(scene.attachments)]
+    copies = members(scene.bodies)
     for place, names in ties:
-        held = {name: named[name] for name in names if name in named}
+        held = {name: named[copies[name][0]] for name in names if name and copies[name][0] in named}
         if len(set(held.values())) > 1:
             said = " and ".join(f"{name!r} ({part})" for name, part in held.items())
             raise SceneError(
