@@ -180,9 +180,11 @@ def simulate(
     if json_output:
         print(json.dumps(recording.to_json()))
     elif not quiet:
-        inside = f"{recording.tets:,} tetrahedra"
-        if recording.particles:
-            inside = f"{recording.particles:,} particles"
+        sizes = {
+            "Gaussians": recording.gaussians,
+            "tetrahedra": recording.tets,
+            "particles": recording.particles,
+        }
         rows = [("asset", str(path)) for path in recording.assets]
         rows += [
             ("simulation", str(recording.simulation)),
@@ -193,7 +195,7 @@ def simulate(
                 "frames",
                 f"{recording.frames}  ({recording.frame_count}, {recording.resumed_frames} of them resumed)",
             ),
-            ("size", f"{recording.gaussians:,} Gaussians, {inside}"),
+            ("size", ", ".join(f"{count:,} {kind}" for kind, count in sizes.items() if count)),
             ("seconds", "  ".join(f"{phase} {value:.1f}" for phase, value in recording.seconds.items())),
         ]
         table(f"Simulation of {checked.name}", rows)

@@ -25,18 +25,20 @@ def with_generated(
     """The scene with an asset file in place of every prompt.
 
     Body NAME's asset becomes `output`/generated/NAME.usdc, its run `output`/generated/NAME/; what an earlier
-    call made there for the same prompt, quality and seed is used again. Raises GuidanceError, OutputError.
+    call made there for the same prompt, quality and seed is used again, and bodies of one prompt and quality
+    share what the first of them is called. Raises GuidanceError, OutputError.
     """
     bodies = []
-    made: dict[str, Path] = {}
+    made: dict[tuple[str, str], Path] = {}
     for body in scene.bodies:
         if body.prompt is None:
             bodies.append(body)
             continue
-        if body.source not in made:
+        key = body.prompt, body.quality
+        if key not in made:
             report = on_progress or (lambda *_: None)
-            made[body.source] = _generate(body, scene.seed, Path(output), device, report)
-        bodies.append(body.model_copy(update={"prompt": None, "asset": str(made[body.source].resolve())}))
+            made[key] = _generate(body, scene.seed, Path(output), device, report)
+        bodies.append(body.model_copy(update={"prompt": None, "asset": str(made[key].resolve())}))
     return scene.model_copy(update={"bodies": tuple(bodies)})
 
 

@@ -130,17 +130,7 @@ def compile_mujoco(
                 "body %r: beside soft bodies it bounces at about 0.8 of its restitution of %.2g",
                 item.name, item.restitution,
             )  # fmt: skip
-    world = MujocoWorld(
-        tuple(made),
-        options.settings(soft),
-        base=None if options.base is None else scene.resolve(options.base),
-        keyframe=options.keyframe,
-        controls=tuple(
-            Control(name, np.array([key.time for key in keys]), np.array([key.value for key in keys]))
-            for name, keys in options.controls.items()
-        ),
-        callback=options.controller,
-    )
+    world = replace(_base(scene, options), bodies=tuple(made), settings=options.settings(soft))
     none = Particles(
         np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32),
         np.zeros(0, np.int32), (), 0.0,
@@ -154,6 +144,19 @@ def compile_mujoco(
         device=device,
     )
     return apply_loads(scene, _numbered(replace(model, particles=None, mujoco=world), assets))
+
+
+def _base(scene: Scene, options: MujocoOptions) -> MujocoWorld:
+    """A world without bodies: the base, and what drives it."""
+    return MujocoWorld(
+        base=None if options.base is None else scene.resolve(options.base),
+        keyframe=options.keyframe,
+        controls=tuple(
+            Control(name, np.array([key.time for key in keys]), np.array([key.value for key in keys]))
+            for name, keys in options.controls.items()
+        ),
+        callback=options.controller,
+    )
 
 
 def _numbered(model: Model, assets: dict[str, Asset]) -> Model:
@@ -195,7 +198,7 @@ def _rigid(where: str, body: SceneBody, placement: Placement, material: Material
     joint = Joint(
         own.joint,
         anchor=own.anchor if own.anchor is not None else _three(solid.centre),
-        axis=own.axis,
+        axis=own.axis or Joint().axis,
         damping=own.joint_damping,
         limits=_limits(own),
     )
@@ -218,12 +221,13 @@ def _rigid(where: str, body: SceneBody, placement: Placement, material: Material
 
 
 def _weighed(where: str, placement: Placement) -> MassProperties:
-    """Of the mesh where it is closed, else of the tets; placed."""
+    """Of the mesh where it is one closed shell, else of the tets: shells may overlap; placed."""
     asset = placement.asset
     vertices = asset.gaussians.vertices.cpu().numpy().astype(np.float64)
     faces = asset.gaussians.faces.cpu().numpy()
     report = validate(vertices, faces)
-    if report.watertight and report.volume > 0.0:
+    closed = report.watertight and report.volume > 0.0
+    if closed and (report.components == 1 or asset.tets is None):
         solid = mass_properties(vertices, faces)
     elif asset.tets is not None:
         solid = tet_mass_properties(asset.tets)
@@ -344,7 +348,7 @@ def _three(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def check_supported(scene: Scene) -> None:
-    """Raise SceneError for what only the other solvers can do, as far as a scene alone says it."""
+    """Raise SceneError for what only other solvers can do, and for a base that MuJoCo cannot read."""
     for body in scene.bodies:
         for key in ("parts", "particles"):
             if getattr(body, key):
@@ -365,6 +369,11 @@ def check_supported(scene: Scene) -> None:
             raise SceneError(f"{where}: `boundary`, `start` and `end` are MPM's; leave them out")
         if collider.mass is not None:
             raise SceneError(f"{where}.mass: is MPM's; in MuJoCo make it a body, which is rigid or soft")
+    options = scene.mujoco_options
+    if options is not None and options.base is not None:
+        from gdpro_sim.simulation.mujoco.base import read_base  # brings MuJoCo
+
+        read_base(_base(scene, options))
 
 
 __all__ = [

@@ -142,17 +142,21 @@ class MujocoSettings:
     """How MuJoCo steps.
 
     timestep:   s at most; a `step(dt)` is cut into equal parts
-    iterations: of the constraint solver at most
+    iterations: of the constraint solver at most; None: 100 of Newton's, 500 conjugate gradients
     tolerance:  at which they end
+    solver:     of constraints: "cg", conjugate gradients, is quick where full flexes touch what stands or
+                each other; beside rigid bodies that move it does not converge, and "newton" does, at a cost
+                that grows faster than the body. "auto" chooses
     impratio:   stiffness of friction over that of contact normals: a high one creeps less
     cone:       of friction; the elliptic one is Coulomb's
     """
 
     timestep: float = 1e-3
-    iterations: int = 100
+    iterations: int | None = None
     tolerance: float = 1e-8
     impratio: float = 100.0
     cone: Literal["elliptic", "pyramidal"] = "elliptic"
+    solver: Literal["auto", "newton", "cg"] = "auto"
 
 
 @dataclass(frozen=True)

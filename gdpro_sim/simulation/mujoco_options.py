@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from gdpro_sim.simulation.callbacks import Callback, taken
-from gdpro_sim.simulation.mujoco_model import JointKind, MujocoSettings, Reduction
+from gdpro_sim.simulation.mujoco_model import JointKind, MujocoSettings
 from gdpro_sim.simulation.options import Number, Options, Vector
 
 SOFT = MujocoSettings(timestep=2e-3, tolerance=1e-6, impratio=1.0)
@@ -32,9 +32,16 @@ class MujocoOptions(Options):
         default=None, gt=0.0, le=0.05,
         description="s, at most; default: 0.001, or 0.002 with soft bodies",
     )  # fmt: skip
-    iterations: int = Field(
-        default=MujocoSettings.iterations, ge=1, le=10_000, description="of the constraint solver, at most"
+    constraints: Literal["auto", "newton", "cg"] = Field(
+        default=MujocoSettings.solver,
+        description="how contacts and joints are solved: Newton's method, conjugate gradients (quicker for "
+        "large full flexes, but slow to converge beside rigid bodies that move), or as the bodies are",
     )
+    iterations: int | None = Field(
+        default=None, ge=1, le=10_000,
+        description="of the constraint solver, at most; default: 100 of Newton's method, 500 of conjugate "
+        "gradients",
+    )  # fmt: skip
     tolerance: float | None = Field(
         default=None, gt=0.0, lt=1.0, description="at which they end; default: 1e-8, or 1e-6 with soft bodies"
     )
@@ -92,13 +99,14 @@ class MujocoOptions(Options):
             self.tolerance or best.tolerance,
             self.impratio or best.impratio,
             self.cone,
+            self.constraints,
         )
 
 
 class MujocoBody(Options):
     """What a body is to MuJoCo."""
 
-    form: Literal["auto", "rigid"] | Reduction = Field(
+    form: Literal["auto", "rigid", "full", "trilinear", "quadratic"] = Field(
         default="auto",
         description="rigid; or soft: full moves every vertex of the tets, trilinear and quadratic move the "
         "nodes of a grid of `cells`; auto: rigid from a Young's modulus of 1e8 Pa on, else full",
@@ -113,7 +121,7 @@ class MujocoBody(Options):
     anchor: Vector | None = Field(
         default=None, description="m, where a hinge or ball turns; default: the body's centre of mass"
     )
-    axis: Vector = Field(default=(0.0, 0.0, 1.0), description="of a hinge or slide")
+    axis: Vector | None = Field(default=None, description="of a hinge or slide, which need it")
     joint_damping: float = Field(default=0.0, ge=0.0, description="N m s/rad, of a slide N s/m")
     limits: tuple[Number, Number] | None = Field(
         default=None, description="of a hinge (degrees) or slide (m), from the start"
@@ -129,8 +137,8 @@ class MujocoBody(Options):
 
     @field_validator("axis")
     @classmethod
-    def _some_way(cls, value: Vector) -> Vector:
-        if not any(value):
+    def _some_way(cls, value: Vector | None) -> Vector | None:
+        if value is not None and not any(value):
             raise ValueError("must not be zero")
         return value
 
@@ -153,6 +161,8 @@ class MujocoBody(Options):
             raise ValueError(f"`{min(given & {'cells', 'self_contact'})}` belongs to a soft body")
         if "cells" in given and self.form not in ("trilinear", "quadratic"):
             raise ValueError(f"`cells` belongs to the forms trilinear and quadratic; this one is {self.form}")
+        if self.joint in ("hinge", "slide") and self.axis is None:
+            raise ValueError(f"a {self.joint} needs an `axis`, such as [0, 0, 1]")
         needed = {
             "anchor": ("hinge", "ball"), "axis": ("hinge", "slide"), "limits": ("hinge", "slide"),
             "joint_damping": ("hinge", "slide", "ball"),

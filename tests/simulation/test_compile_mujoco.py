@@ -154,7 +154,16 @@ def test_pieces_are_kept_in_the_file(ball: Asset, tmp_path: Path) -> None:
         ({"mujoco": {"joint": "free", "axis": [0, 0, 1]}}, {}, "axis.* belongs to a joint hinge or slide"),
         ({"mujoco": {"joint": "hinge", "limits": [5, 5]}}, {}, "upper limit must lie above"),
         ({"mujoco": {"form": "rigid"}}, {"solver": {"kind": "fem"}}, "mujoco: belongs to"),
-        ({"forces": {"side": "top", "force": [0, 0, 1]}}, {}, "forces: the MuJoCo solver has none"),
+        ({"mujoco": {"joint": "hinge"}}, {}, "a hinge needs an `axis`"),
+        ({"mujoco": {"form": "soft"}}, {}, "must be 'auto', 'rigid', 'full', 'trilinear' or 'quadratic'"),
+        ({"particles": 100}, {}, "particles: belongs to MPM"),
+        ({}, {"colliders": {"kind": "plane", "motion": {"time": 1}}}, "motion: a plane stands still"),
+        (
+            {"material": "steel", "mujoco": {"shape": "box"},
+             "impulses": {"side": "top", "velocity": [0, 0, 1]}},
+            {}, "cannot gain a velocity alone",
+        ),
+        ({"material": "steel", "mujoco": {"shape": "box"}, "pressures": {"pressure": 5}}, {}, "does nothing"),
         ({"material": "steel", "pins": {"side": "top"}, "mujoco": {"shape": "box"}}, {}, "joint: fixed"),
         ({"material": "water"}, {}, "flows or tears"),
         ({"material": "jelly", "pins": {"side": "top", "release": 1}}, {}, "leave out `start` and `release`"),
@@ -205,5 +214,5 @@ def test_plain_mujoco_reads_the_folder(ball: Asset, tmp_path: Path, form: str) -
         )
         assert plain.returncode == 0, plain.stderr
         found = json.loads(plain.stdout)
-        assert found["mass"] == pytest.approx(summary["mass"], rel=1e-5)
+        assert found["mass"] == pytest.approx(summary["mass_kg"], rel=1e-5)
         assert found["warnings"] == 0

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from gdpro_sim.errors import OutputError
 from gdpro_sim.files import atomic_write, prepare_folder
@@ -64,7 +63,7 @@ def export_mjcf(solver: SolverMuJoCo, folder: str | Path) -> dict[str, Any]:
         "geoms": compiled.ngeom,
         "flexes": compiled.nflex,
         "degrees_of_freedom": compiled.nv,
-        "mass": float(compiled.body_mass[np.asarray(solver.counted)].sum()),
+        "mass_kg": float(f"{compiled.body_mass[solver.counted].sum():.9g}"),
         "renamed": dict(solver.renamed),
     }
 

@@ -16,10 +16,17 @@ from gdpro_sim.meshing.convex import decompose, mass_properties
 from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mujoco import rigid, soft
+from gdpro_sim.simulation.mujoco.base import read_base
 from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, LEAST, add_pair, reference, set_contact
 from gdpro_sim.simulation.mujoco_model import MujocoWorld, RigidBody, Shape, SoftBody
 
 log = logging.getLogger(__name__)
+
+NEWTON_ITERATIONS, CG_ITERATIONS = 100, 500
+"""At most, where a scene does not say."""
+
+NEWTON_VERTICES = 1500
+"""Of full flexes, up to which Newton's method is used beside rigid bodies that move."""
 
 CONVEX = 0.99
 """A mesh that fills this share of its convex hull is taken as convex."""
@@ -60,7 +67,7 @@ def build(model: Model) -> World:
     world = model.mujoco
     if world is None:
         raise SceneError("the model has nothing for MuJoCo")
-    spec, start = _base(world)
+    spec, start = read_base(world)
     taken = _names(spec)
     renamed: list[tuple[str, str]] = []
 
@@ -127,39 +134,6 @@ def compile_spec(spec: mujoco.MjSpec, where: str = "the scene") -> mujoco.MjMode
         raise SceneError(f"{where}: MuJoCo cannot compile it: {' '.join(str(error).split())}") from None
 
 
-def _base(world: MujocoWorld) -> tuple[mujoco.MjSpec, tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
-    """The spec of the base, without its keyframes, and the state of the one it starts from."""
-    if world.base is None:
-        spec = mujoco.MjSpec()
-        spec.modelname = "gdpro"
-        return spec, None
-    if not world.base.is_file():
-        raise SceneError(f"{world.base}: no such file")
-    try:
-        spec = mujoco.MjSpec.from_file(str(world.base))
-        alone = spec.copy().compile()
-    except (ValueError, mujoco.FatalError) as error:
-        message = " ".join(str(error).split())
-        raise SceneError(f"{world.base}: MuJoCo cannot compile it: {message}") from None
-    names = [key.name for key in spec.keys]
-    for key in list(spec.keys):  # they would have to name the joints of our bodies, too
-        spec.delete(key)
-    _check_known(f"{world.base}: keyframe", [world.keyframe] if world.keyframe else [], names)
-    actuators = [item.name for item in spec.actuators]
-    _check_known(f"{world.base}: actuator", [item.actuator for item in world.controls], actuators)
-    if world.keyframe is None:
-        return spec, None
-    k = names.index(world.keyframe)
-    return spec, (alone.key_qpos[k].copy(), alone.key_qvel[k].copy(), alone.key_ctrl[k].copy())
-
-
-def _check_known(what: str, wanted: list[str], names: list[str]) -> None:
-    for name in wanted:
-        if name not in names:
-            known = ", ".join(repr(item) for item in names if item) or "none with a name"
-            raise SceneError(f"{what} {name!r}: there is none; there are: {known}")
-
-
 def _names(spec: mujoco.MjSpec) -> set[str]:
     """Names of a base that ours must not meet; MuJoCo wants them unique within each kind of thing."""
     kinds = (spec.bodies, spec.joints, spec.geoms, spec.meshes, spec.flexes)
@@ -170,7 +144,7 @@ def _options(spec: mujoco.MjSpec, model: Model, world: MujocoWorld) -> None:
     option, settings = spec.option, world.settings
     soft_bodies = [body for body in world.bodies if isinstance(body, SoftBody)]
     option.timestep, option.gravity = settings.timestep, list(model.gravity)
-    option.iterations, option.tolerance = settings.iterations, settings.tolerance
+    option.tolerance = settings.tolerance
     option.impratio = settings.impratio
     option.cone = (
         mujoco.mjtCone.mjCONE_ELLIPTIC if settings.cone == "elliptic" else mujoco.mjtCone.mjCONE_PYRAMIDAL
@@ -181,8 +155,7 @@ def _options(spec: mujoco.MjSpec, model: Model, world: MujocoWorld) -> None:
         # Only this integrator takes the elasticity of flexes implicitly.
         option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
         option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
-        full = any(body.reduction == "full" for body in soft_bodies)
-        option.solver = mujoco.mjtSolver.mjSOL_CG if full else mujoco.mjtSolver.mjSOL_NEWTON
+        option.solver = mujoco.mjtSolver.mjSOL_CG if _large(world) else mujoco.mjtSolver.mjSOL_NEWTON
         count = sum(len(body.vertices) for body in soft_bodies)
         spec.memory = max(spec.memory, MEMORY + 200_000 * count)
     elif world.base is None:
@@ -190,6 +163,23 @@ def _options(spec: mujoco.MjSpec, model: Model, world: MujocoWorld) -> None:
         bouncy = any(b.restitution > LEAST for b in world.bodies if isinstance(b, RigidBody))
         kind = mujoco.mjtIntegrator.mjINT_IMPLICIT if bouncy else mujoco.mjtIntegrator.mjINT_DISCRETE
         option.integrator, option.solver = kind, mujoco.mjtSolver.mjSOL_NEWTON
+    if settings.solver != "auto":
+        newton = settings.solver == "newton"
+        option.solver = mujoco.mjtSolver.mjSOL_NEWTON if newton else mujoco.mjtSolver.mjSOL_CG
+    conjugate = option.solver == mujoco.mjtSolver.mjSOL_CG
+    option.iterations = settings.iterations or (CG_ITERATIONS if conjugate else NEWTON_ITERATIONS)
+
+
+def _large(world: MujocoWorld) -> bool:
+    """Whether conjugate gradients solve the contacts of full flexes sooner than Newton's method.
+
+    They hardly converge where a rigid body that moves touches a flex: it weighs so much more than a vertex.
+    """
+    full = [body for body in world.bodies if isinstance(body, SoftBody) and body.reduction == "full"]
+    moving = world.base is not None or any(
+        isinstance(body, RigidBody) and body.joint.kind != "fixed" for body in world.bodies
+    )
+    return bool(full) and not (moving and sum(len(body.vertices) for body in full) <= NEWTON_VERTICES)
 
 
 def _rigid(world: MujocoWorld, number: int) -> RigidBody:
