@@ -328,9 +328,9 @@ def _open(output: Path, mark: str, count: int, fresh: bool) -> tuple[Path, dict[
         try:
             known = _read_json(folder / "dataset.json")
         except OutputError:
-            known = {"count": 0}
-    elif any((folder / "rollouts").glob("*")):
-        known = {"count": 0}
+            pass
+    if (not known and any((folder / "rollouts").glob("*"))) or known.get("format", FORMAT) != FORMAT:
+        raise RequestError(f"{folder} holds other files named like a dataset's; give another folder")
     if known and (fresh or known.get("fingerprint") != mark):
         if not fresh:
             raise RequestError(

@@ -243,6 +243,14 @@ def test_wrong_requests_are_told_before_anything_runs(
     assert files_of(folder / "made") == before
 
 
+def test_files_of_others_are_never_replaced(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "rollouts").mkdir()
+    (tmp_path / "rollouts/mine.txt").write_text("mine")
+    with pytest.raises(GdproError, match="holds other files named like a dataset's"):
+        rollout(folder / "scene.yaml", tmp_path, count=1, fresh=True)
+    assert (tmp_path / "rollouts/mine.txt").read_text() == "mine"
+
+
 def test_the_command(folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / "ball.usdc", tmp_path)
     text = SCENE.split("randomize:")[0].split("camera:")[0]
