@@ -66,6 +66,12 @@ DEEPEST = wp.constant(0.5)
 FAR = wp.constant(1.0e30)
 """Gap of a node without matter near, m."""
 
+LEAST_ROOM = wp.constant(0.05)
+"""Share of a node's surroundings that counts as free at least."""
+
+ALONGSIDE = wp.constant(0.7)
+"""Cosine between normals of obstacles at a node from which they fill the same space."""
+
 SUMS = wp.constant(42)
 """Numbers of `sum_coupling`: a matrix 6 x 6, row by row, and a vector."""
 
@@ -332,3 +338,65 @@ def sum_coupling(
                     wp.atomic_add(sums_out, place, 6 * (3 + a) + 3 + b, -SDS[a, b])
                 wp.atomic_add(sums_out, place, 36 + a, given[a])
                 wp.atomic_add(sums_out, place, 39 + a, moment[a])
+
+
+@wp.func
+def free_share(distance: float, width: int) -> float:
+    """Share of a spline's weight outside an even wall that its middle is `distance` cells outside of."""
+    reach = 0.5 * float(width)
+    x = wp.clamp(distance, -reach, reach)
+    a = wp.abs(x)
+    beyond = float(0.0)  # of the weight further out than a
+    if width == 3:
+        beyond = (1.5 - a) * (1.5 - a) * (1.5 - a) / 6.0
+        if a < 0.5:
+            beyond = 0.5 - 0.75 * a + a * a * a / 3.0
+    else:
+        beyond = (2.0 - a) * (2.0 - a) * (2.0 - a) * (2.0 - a) / 24.0
+        if a < 1.0:
+            beyond = 0.5 - 2.0 / 3.0 * a + a * a * a / 3.0 - a * a * a * a / 8.0
+    return wp.where(x < 0.0, beyond, 1.0 - beyond)
+
+
+@wp.kernel
+def fill_obstacles(
+    start: int,
+    # In:
+    width: int,
+    near: wp.array[int],
+    starts: wp.array[int],
+    pairs: wp.array[int],
+    owner: wp.array[int],
+    field: wp.array[wp.vec4],
+    table: wp.array2d[wp.float64],
+    spacing: float,
+    # Out:
+    values_out: wp.array[wp.vec4],
+):
+    """Mass that nodes would have if what is around them went on inside obstacles.
+
+    Divides it by the share of a node's spline outside them: matter that lies at a wall is no less dense than
+    elsewhere. Obstacles that fill the same space count once.
+    """
+    i = start + wp.tid()
+    k = i // 64
+    n = i % 64
+    first = starts[k]
+    end = starts[k + 1]
+    value = values_out[64 * near[k] + n]
+    if value[3] == 0.0:
+        return
+    room = float(1.0)
+    for j in range(first, end):
+        f = field[64 * pairs[j] + n]
+        if int(table[owner[pairs[j]], KIND]) != ABSENT and f[3] < 0.5 * float(width) * spacing:
+            covered = bool(False)
+            for o in range(first, end):
+                g = field[64 * pairs[o] + n]
+                closer = g[3] < f[3] or (g[3] == f[3] and o < j)
+                if closer and int(table[owner[pairs[o]], KIND]) != ABSENT:
+                    covered = covered or f[0] * g[0] + f[1] * g[1] + f[2] * g[2] > ALONGSIDE
+            if not covered:
+                room *= free_share(f[3] / spacing, width)
+    mass = value[3] / wp.max(room, LEAST_ROOM)
+    values_out[64 * near[k] + n] = wp.vec4(value[0], value[1], value[2], mass)

@@ -21,7 +21,7 @@ _ROWS = "".join(
     f"    const int {name} = {int(getattr(rows, name))};\n"
     for name in (
         "VELOCITY", "AFFINE", "DEFORMATION", "DEFORMATION_LOW", "STRESS", "VOLUME", "SPEED", "INTERNAL",
-        "DENSITY",
+        "DENSITY", "SLOPE",
     )
 )  # fmt: skip
 

@@ -20,7 +20,8 @@ values s of F, e = log s, J = det F, b = F F^T, and the energies of `gdpro_sim.k
                         34(5); here in logarithmic strains, which keep volume exactly)
     FLUID               J alone resists: p = K / 7 (J^-7 - 1), no tension (Monaghan 1994, "Simulating free
                         surface flows with SPH", JCP 110); Newtonian shear viscosity. J follows the
-                        velocity's divergence and, slowly, the grid's density where particles have clumped
+                        velocity's divergence, and the grid's density where particles have clumped (slowly)
+                        or come apart
 
 Plastic flow needs the eigenvectors Q of b alone, no singular value decomposition: F becomes
 Q diag(s_new / s) Q^T F.
@@ -82,12 +83,20 @@ B = wp.constant(11)  # cone's tip, volume strain | theta_s | flow index
 C = wp.constant(12)  # log J over which cohesion is lost | xi
 COLUMNS = wp.constant(13)
 
-PACKING = (10.0, 0.02)
+PACKING = (5.0, 0.02)
 """Where a fluid's particles have clumped, J falls towards the grid's ratio of volumes and this much more, at
 this rate, 1/s: else J, which is integrated along the particles, would drift from where they are."""
 
-LOOSE = 0.05
-"""A fluid that has come apart resists compression anew from this J - 1 on at the latest."""
+PARTING = 100.0
+"""1/s, at which J rises towards the grid's ratio of volumes where particles lie further apart: else a fluid
+that has come apart would not come together again."""
+
+EDGE = (0.35, 0.5)
+"""Near a fluid's surface the grid is lighter because it sees the air: so many times the change of density
+over a cell are added to the density, and where it changes by the second number (relative) J does not rise."""
+
+LOOSE = 2.0
+"""Largest J - 1 that a fluid remembers."""
 
 
 def groups(count: int, device: str) -> int:
@@ -402,16 +411,20 @@ _FLUID = """
         F more = (known + 1.0f) * growth;
         if (particles.shape[0] > DENSITY) {
             const F packed = row(DENSITY) * constant(LIGHTNESS);
+            const F slope = row(SLOPE) * constant(LIGHTNESS);
             const F least = 1.0f / max_(packed, splat(0.1f)) - 1.0f + SPARE;
+            const F most = 1.0f / max_(packed + EDGE * slope, splat(0.1f)) - 1.0f;
+            const F inside = select(packed > 0.0f, max_(1.0f - slope * (1.0f / STEEP), zero), zero);
             more += min_(least - known, zero) * min_(splat(h * PACKING), one);
+            more += inside * max_(most - known, zero) * min_(splat(h * PARTING), one);
         }
         const F after = known + more;
         const F bounded = max_(min_(after, splat(LOOSE)), splat(-0.7f));
         change = select(fluid, select(bounded == after, more, bounded - known), change);
         const F p = max_(lam * (1.0f / 7.0f) * expm1_(-7.0f * log1p_(bounded)), zero);
-        J = select(fluid, bounded + 1.0f, J);
+        J = select(fluid, min_(bounded + 1.0f, one), J);  // volume that carries stress
         for (int i = 0; i < 3; ++i) tau[i] = select(fluid, -J * p, tau[i]);
-        stiff = select(fluid, max_(J * (7.0f * p + lam), lam), stiff);
+        stiff = select(fluid, J * (7.0f * p + lam), stiff);
         for (int i = 0; i < 9; ++i) {
             put(DEFORMATION + i, select(fluid, i % 4 == 0 ? one : zero, row(DEFORMATION + i)));
             put(DEFORMATION_LOW + i, select(fluid, zero, row(DEFORMATION_LOW + i)));
@@ -460,6 +473,9 @@ _UPDATE = f"""
 #define LOOSE {LOOSE}f
 #define PACKING {PACKING[0]}f
 #define SPARE {PACKING[1]}f
+#define PARTING {PARTING}f
+#define EDGE {EDGE[0]}f
+#define STEEP {EDGE[1]}f
 {LANE_MATH}
 {_BEGIN}
 {_PRINCIPAL}
@@ -469,6 +485,9 @@ _UPDATE = f"""
 #undef LOOSE
 #undef PACKING
 #undef SPARE
+#undef PARTING
+#undef EDGE
+#undef STEEP
 """
 
 
@@ -497,9 +516,9 @@ def update_stress(
     """The materials' answer to a substep of h seconds; with h = 0, to the deformation as it is.
 
     In: rows DEFORMATION (trial) and DEFORMATION_LOW, AFFINE (the velocity gradient), VELOCITY, VOLUME,
-    INTERNAL, and DENSITY where there is one. Out: STRESS, SPEED, INTERNAL; DEFORMATION and its low part where
-    matter flows; VELOCITY and AFFINE under damping on mass. Indices are `groups`. `matter` [N] are rows of
-    `table` [materials, COLUMNS].
+    INTERNAL, and DENSITY and SLOPE where there are such. Out: STRESS, SPEED, INTERNAL; DEFORMATION and its
+    low part where matter flows; VELOCITY and AFFINE under damping on mass. Indices are `groups`. `matter` [N]
+    are rows of `table` [materials, COLUMNS].
     """
     group = start + wp.tid()
     mask = degenerate_lanes(group, matter, particles_out)

@@ -16,6 +16,7 @@ from gdpro_sim.kernels.particles import (
     MASS,
     POSITION,
     POSITION_LOW,
+    SLOPE,
     STRESS,
     TOTAL,
     VELOCITY,
@@ -158,6 +159,7 @@ def gather_particles(
     v = wp.vec3()
     mass = float(0.0)
     moment = wp.mat33()
+    lean = wp.vec3()
     for a in range(width):
         for b in range(width):
             for c in range(width):
@@ -166,7 +168,9 @@ def gather_particles(
                 part = weight * wp.vec3(value[0], value[1], value[2])
                 v += part
                 mass += weight * value[3]
-                moment += wp.outer(part, wp.vec3(float(a), float(b), float(c)) - f)
+                way = wp.vec3(float(a), float(b), float(c)) - f
+                moment += wp.outer(part, way)
+                lean += weight * value[3] * way
     scale = 4.0 * inverse
     if width == 4:
         scale = 3.0 * inverse
@@ -182,7 +186,9 @@ def gather_particles(
     if particles_out.shape[0] > TOTAL:
         total = read_matrix(particles_out, TOTAL, i)
         write_matrix(total + h * (C * total), TOTAL, i, particles_out)
-        particles_out[DENSITY, i] = mass * inverse * inverse * inverse
+        per_cell = inverse * inverse * inverse
+        particles_out[DENSITY, i] = mass * per_cell
+        particles_out[SLOPE, i] = scale * spacing * wp.length(lean) * per_cell
     x = read_vector(particles_out, POSITION, i)
     for k in range(3):
         u = x[k] * inverse

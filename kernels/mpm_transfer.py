@@ -32,6 +32,7 @@ from gdpro_sim.kernels.particles import (
     MASS,
     POSITION,
     POSITION_LOW,
+    SLOPE,
     STRESS,
     TOTAL,
     VELOCITY,
@@ -281,7 +282,14 @@ _GATHER_MOVE = """
                     put(TOTAL + 3 * i + j, row(TOTAL + 3 * i + j)
                         + h * (C[3 * i] * a0 + C[3 * i + 1] * a1 + C[3 * i + 2] * a2));
             }
-            put(DENSITY, R[3] * (inverse * inverse * inverse));
+            const F per_cell = splat(inverse * inverse * inverse);
+            put(DENSITY, R[3] * per_cell);
+            F square = splat(0.0f);
+            for (int a = 0; a < 3; ++a) {
+                const F slope = (R[4 + 4 * a + 3] - f[a] * R[3]) * (WIDTH == 3 ? 4.0f : 3.0f);
+                square += slope * slope;
+            }
+            put(SLOPE, sqrt_(square) * per_cell);
         }
 """
 
@@ -308,6 +316,7 @@ def snippet(width: int, before: str, each: str, after: str = "") -> str:
         "MASS": MASS,
         "TOTAL": TOTAL,
         "DENSITY": DENSITY,
+        "SLOPE": SLOPE,
     }
     text = _GROUPS
     parts = {"before": before, "prelude": PRELUDE, "weights": _WEIGHTS, "each": each, "after": after}

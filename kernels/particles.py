@@ -12,7 +12,9 @@
     SPEED            1  m/s, of sound in the particle plus its own: bounds the next step
     INTERNAL         4  what the material remembers; its law says what of
     TOTAL            9  deformation gradient since the start, elastic or not; only where some material flows
-    DENSITY          1  kg/m^3, of the grid around the particle; only where some material flows
+    DENSITY          1  kg/m^3, of the grid around the particle, as if matter went on inside obstacles where
+                        there is a fluid; only where some material flows
+    SLOPE            1  kg/m^3, by how much that changes over a cell where it is steepest
 
 A substep changes positions and strains by less than float32 can add to them: the sum of a number and its LOW
 part is what is meant (Kahan's compensated summation).
@@ -40,7 +42,8 @@ SPEED = wp.constant(44)
 INTERNAL = wp.constant(45)
 TOTAL = wp.constant(49)
 DENSITY = wp.constant(58)
-ROWS = wp.constant(59)
+SLOPE = wp.constant(59)
+ROWS = wp.constant(60)
 
 
 @wp.func

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gdpro_sim import device as devices
 from gdpro_sim.errors import SolverError
+from gdpro_sim.kernels import particles as particle_rows
 from gdpro_sim.materials import Material
 from gdpro_sim.simulation.colliders import Collider, ColliderOptions, compile_collider
 from gdpro_sim.simulation.conditions import Force, Hold, Impulse, Motion, Wind
@@ -306,6 +307,26 @@ def test_particles_stay_in_the_domain() -> None:
         solver.step(1 / 60)
         x = solver.positions
         assert (x >= np.float32(domain[0])).all() and (x <= np.float32(domain[1])).all()
+
+
+@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+@pytest.mark.parametrize("floor", [None, Ground()])
+def test_a_full_tank_is_as_dense_at_its_walls_as_inside(kernel: Any, floor: Ground | None) -> None:
+    """Of the grid around particles; without what would lie inside the walls an eighth of it in corners.
+
+    Two obstacles that fill the same space, the ground and a wall of the domain, count once.
+    """
+    settings = MpmSettings(domain=((0.0, 0.0, 0.0), (0.2, 0.2, 0.2)), kernel=kernel)
+    model = block(mpm=settings, ground=floor)
+    assert model.particles is not None
+    water = Material(model="fluid", bulk_modulus=1.0e5, viscosity=0.0, density=1000.0)
+    solver = SolverMPM(
+        dataclasses.replace(model, particles=dataclasses.replace(model.particles, materials=(water,)))
+    )
+    solver.step(1e-4)
+    density = solver.grid.rows(int(particle_rows.DENSITY), 1)[:, 0]
+    assert density.mean() == pytest.approx(1000.0, rel=0.03)
+    assert np.abs(density - 1000.0).max() < 150.0
 
 
 def test_what_starts_outside_the_domain_is_refused() -> None:

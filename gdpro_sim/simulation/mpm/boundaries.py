@@ -108,6 +108,7 @@ class Obstacles:
         share = np.bincount(model.particles.matter, model.particles.volumes, len(friction))
         self._usual_friction = float(share @ friction / share.sum())
         self._one_friction = bool(np.ptp(friction) == 0.0)
+        self._fluid = any(material.model == "fluid" for material in model.particles.materials)
         self._listed: wp.array | None = None  # the blocks that are listed
         self._empty = True
         self._impulse: wp.array = wp.zeros((0, 6), dtype=wp.float64, device=model.device)
@@ -162,6 +163,16 @@ class Obstacles:
             [grid.values, self._impulse],
             minimum=16 * 64 // count,
         )  # fmt: skip
+
+    def fill(self, grid: Grid) -> None:
+        """Give nodes the mass that they would have if fluids went on inside obstacles: for their density."""
+        if self._empty or not self._fluid:
+            return
+        inputs = [
+            grid.width, self._near, self._starts, self._order, self._owner, self._field, self._table,
+            grid.spacing,
+        ]  # fmt: skip
+        grid.launch(kernels.fill_obstacles, 64 * len(self._near), inputs, [grid.values], minimum=4096)
 
     def drive(self, grid: Grid, h: float) -> None:
         if not self._empty:
@@ -296,7 +307,8 @@ class Obstacles:
             normal = self._host[c, kernels.ROTATION : kernels.LINEAR].reshape(3, 3)[:, 2]
             beyond = self._sees + self._radius / grid.spacing
             cells = reach * float(np.abs(normal).sum())
-            cells += mpm_gaps.OUTSIDE if reach == NODES_REACH else beyond
+            outside = 0.5 * grid.width if self._fluid else float(mpm_gaps.OUTSIDE)
+            cells += outside if reach == NODES_REACH else beyond
         if c in self._moving:
             cells += MARGIN
         return np.flatnonzero(distance.numpy() <= cells * grid.spacing)

@@ -205,6 +205,8 @@ class SolverMPM:
             h = self._solve(self._newton, h)
         if self._flip > 0.0:
             grid.give_change()
+        if self._obstacles is not None:
+            self._obstacles.fill(grid)
         grid.gather(h, self._flip)
         for boundary in self.boundaries:
             boundary.drive(grid, h)
