@@ -548,6 +548,36 @@ def _some(plan: _Plan, indices: list[int], seconds: dict[str, float]) -> Iterato
         yield len(names)
 
 
+# ---- reading ----
+
+
+def scene_of_rollout(dataset: str | Path, index: int, *, files: str | Path = ".") -> Scene:
+    """The scene of one rollout, with the values drawn for it and the dataset's own assets.
+
+    files: folder where the scene stood: other files that it names (base, meshes of obstacles) are found there
+    Raises RequestError where the folder holds no dataset, or not so many rollouts.
+
+        gdpro_sim.record(scene_of_rollout("dataset", 17), "run_17")
+    """
+    folder = Path(dataset).absolute()
+    if not (folder / "dataset.json").is_file():
+        raise RequestError(f"{dataset}: holds no dataset.json; give the folder of a dataset")
+    about = _read_json(folder / "dataset.json")
+    if not 0 <= index < about["count"]:
+        raise RequestError(f"{dataset}: has rollouts 0 to {about['count'] - 1}, got {index}")
+    scene = check_scene(
+        {**about["scene"], "folder": Path(files).absolute(), "randomize": about["randomize"]}, str(dataset)
+    )
+    stored = {"color": None, "texture": None, "prompt": None}
+    bodies = [
+        body.model_copy(update={**stored, "asset": str(folder / f"assets/{body.source}.usdc")})
+        for body in scene.bodies
+    ]
+    scene = scene.model_copy(update={"bodies": tuple(bodies)})
+    drawn, _ = draw(scene, scene.randomize, scene.seed, index)
+    return drawn.model_copy(update={"randomize": ()})  # type: ignore[no-any-return]
+
+
 def _scale(placed: Asset, stored: Asset) -> float:
     sizes = [
         float(np.ptp(asset.gaussians.vertices.cpu().numpy(), axis=0).max()) for asset in (placed, stored)
@@ -555,4 +585,4 @@ def _scale(placed: Asset, stored: Asset) -> float:
     return sizes[0] / sizes[1]
 
 
-__all__ = ["ARRAYS", "FORMAT", "VERSION", "Dataset", "rollout"]
+__all__ = ["ARRAYS", "FORMAT", "VERSION", "Dataset", "rollout", "scene_of_rollout"]

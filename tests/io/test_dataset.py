@@ -13,13 +13,12 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from gdpro_sim.asset import Asset, import_mesh, tetrahedralize_asset
+from gdpro_sim.asset import import_mesh, tetrahedralize_asset
 from gdpro_sim.cli import app
 from gdpro_sim.errors import GdproError
-from gdpro_sim.io.dataset import rollout
-from gdpro_sim.simulation.randomize import draw, expand
+from gdpro_sim.io.dataset import rollout, scene_of_rollout
+from gdpro_sim.simulation.compile import load_assets
 from gdpro_sim.simulation.run import Simulation
-from gdpro_sim.simulation.scene import Scene, load_scene
 from tests.meshing.shapes import sphere, write_obj
 
 RADIUS = 0.1
@@ -72,16 +71,10 @@ def read(folder: Path, index: int) -> tuple[dict[str, Any], dict[str, np.ndarray
     return record, arrays, {name: np.asarray(Image.open(where / name)) for name in record["images"]}
 
 
-def scene_of_rollout(folder: Path, index: int) -> tuple[Scene, Simulation]:
-    scene = load_scene(folder / "scene.yaml")
-    asset = Asset.load(folder / "made/assets/ball.usdc")
-    changed, _ = draw(scene, expand(scene, scene.randomize), scene.seed, index)
-    return changed, Simulation(changed, {"ball": asset, "jelly": asset}, device="cpu")
-
-
 def test_a_rollout_is_the_run_of_its_scene(folder: Path) -> None:
     record, arrays, _ = read(folder / "made", 1)
-    scene, simulation = scene_of_rollout(folder, 1)
+    scene = scene_of_rollout(folder / "made", 1)
+    simulation = Simulation(scene, load_assets(scene), device="cpu")
     assert record["parameters"]["bodies.jelly.material.young"] == scene.bodies[1].material.young
     with np.load(folder / "made/bodies/ball.npz") as data:
         mesh = {key: data[key] for key in data.files}
@@ -249,6 +242,13 @@ def test_files_of_others_are_never_replaced(folder: Path, tmp_path: Path) -> Non
     with pytest.raises(GdproError, match="holds other files named like a dataset's"):
         rollout(folder / "scene.yaml", tmp_path, count=1, fresh=True)
     assert (tmp_path / "rollouts/mine.txt").read_text() == "mine"
+
+
+def test_only_rollouts_that_are_there_have_scenes(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(GdproError, match="has rollouts 0 to 1, got 2"):
+        scene_of_rollout(folder / "made", 2)
+    with pytest.raises(GdproError, match="holds no dataset"):
+        scene_of_rollout(tmp_path, 0)
 
 
 def test_the_command(folder: Path, tmp_path: Path) -> None:
