@@ -157,8 +157,8 @@ def check_supported(scene: Scene) -> None:
         animation_supports(scene)
     elif isinstance(scene.solver, FemOptions):
         for body in scene.bodies:
-            if body.material is not None:
-                _check_elements(f"{scene.name}: body {body.name!r}", body, (body.material,))
+            made = () if body.material is None else (body.material,)
+            _check_elements(f"{scene.name}: body {body.name!r}", body, made)
             for k, pin in enumerate(body.pins):
                 if pin.start > 0.0:
                     raise SceneError(

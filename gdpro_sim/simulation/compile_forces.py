@@ -328,7 +328,7 @@ Tied = tuple[int, Attachment, Faced, Faced, np.ndarray]
 
 
 def tied(scene: Scene, bodies: Mapping[str, Faced]) -> Iterator[Tied]:
-    """Attachments by number, the bodies that each ties, and the tied points of the first body, from its first.
+    """Attachments by number, the bodies each ties, and the tied points of the first body, from its first.
 
     They lie on its surface. One that names copies ties all pairs that are near enough. Raises SceneError for
     one that ties none.

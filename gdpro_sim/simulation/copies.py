@@ -168,7 +168,7 @@ def expand(bodies: tuple[SceneBody, ...], seed: int) -> tuple[SceneBody, ...]:
         clashes += [copy.name for copy in made if copy is not body and copy.name in seen]
         out += made
     if clashes:
-        raise ValueError(f"copies would be named like other bodies: {', '.join(clashes)}; rename those bodies")
+        raise ValueError(f"copies would be named like other bodies: {', '.join(clashes)}; rename those")
     return tuple(out)
 
 

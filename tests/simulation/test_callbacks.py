@@ -87,7 +87,10 @@ def test_every_solver_follows_a_function(cube: Asset, kind: str) -> None:
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (lambda t: STILL if t < 0.5 else 1 / (t - 0.5), r"at 0.5 s raised ZeroDivisionError: .*\(test_callbacks.py, line \d+\)"),
+        (
+            lambda t: STILL if t < 0.5 else 1 / (t - 0.5),
+            r"at 0.5 s raised ZeroDivisionError: .*\(test_callbacks.py, line \d+\)",
+        ),
         (
             lambda t: ((0, 0, math.nan if t else 0), (0, 0, 0)),
             r"at 0.5 s gave \(\(0, 0, nan\), .* finite num",

@@ -13,7 +13,7 @@ from gdpro_sim.asset import Asset, import_mesh, tetrahedralize_asset
 from gdpro_sim.cli import main
 from gdpro_sim.errors import AssetError, SceneError
 from gdpro_sim.materials import LAWS
-from gdpro_sim.simulation.compile import check_files, compile_scene
+from gdpro_sim.simulation.compile import check_files, compile_scene, load_assets
 from gdpro_sim.simulation.conditions import Force, Impulse, Pressure, Wind
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.model import Model
@@ -65,6 +65,29 @@ def test_placement(ball: Asset) -> None:
     np.testing.assert_allclose([middle[0], middle[1], surface[:, 2].min()], [1, 2, 3], atol=1e-5)
     centred = compiled(ball, anchor="center", position=[0, 0, 2]).bodies[0].surface
     np.testing.assert_allclose(0.5 * (centred.min(0) + centred.max(0)), [0, 0, 2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        ({"solver": {"kind": "mpm"}, "wind": {}}, "wind: the MPM solver has none"),
+        ({"solver": {"kind": "mpm"}, "body": {"pressures": {"pressure": 1}}}, "pressures: the MPM solver"),
+        ({"body": {"material": "sand"}}, "kind: mpm"),
+        ({"body": {"particles": 9}}, "`particles` belongs to MPM"),
+        ({"body": {"pins": {"side": "top", "start": 1}}}, r"pins\[0\].start: belongs to MPM"),
+        (
+            {"solver": {"kind": "mujoco"}, "body": {"pins": {"side": "top", "release": 1}}},
+            "leave out `start`",
+        ),
+    ],
+)
+def test_what_a_solver_cannot_do_is_said_before_assets_are_made(
+    tmp_path: Path, scene: dict, message: str
+) -> None:
+    (tmp_path / "broken.obj").write_text("nothing that could be imported")
+    body = {"asset": "broken.obj", **scene.pop("body", {})}
+    with pytest.raises(SceneError, match=message):
+        load_assets(check_scene({"bodies": [body], "folder": tmp_path, **scene}))
 
 
 def test_wrong_placements_are_refused(ball: Asset) -> None:
