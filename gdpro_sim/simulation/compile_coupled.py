@@ -12,6 +12,7 @@ import numpy as np
 
 from gdpro_sim.asset import Asset
 from gdpro_sim.errors import MeshError, SceneError
+from gdpro_sim.meshing.embedding import boundary
 from gdpro_sim.meshing.repair import validate
 from gdpro_sim.simulation.colliders import Collider, mesh_collider, shape_collider
 from gdpro_sim.simulation.compile_mujoco import STIFF
@@ -99,6 +100,10 @@ def compile_coupled(
     for part in ("fem", "mpm"):
         if part in parts:
             parts[part] = replace(parts[part], colliders=(*parts[part].colliders, *still, *stands))
+    if "fem" in parts:
+        _warn_small(
+            parts["fem"], (*still, *stands, *(c for link in (*links, *of_base) for c in link.colliders))
+        )
     numbers = {body.name: (part, k) for part in parts for k, body in enumerate(parts[part].bodies)}
     return _joined(Coupling(
         parts, tuple(numbers[body.name] for body in scene.bodies), (*links, *of_base), step=options.step,
@@ -256,6 +261,32 @@ def _warn_apart(named: dict[str, str]) -> None:
             "bodies of FEM (%s) and of MPM (%s) meet rigid ones, but pass through each other",
             ", ".join(fem), ", ".join(mpm),
         )  # fmt: skip
+
+
+def _warn_small(model: Model, solids: tuple[Collider, ...]) -> None:
+    """Tell of obstacles that fit between a FEM body's vertices, which alone touch."""
+    for body in model.bodies:
+        tets = model.tets[slice(*body.tet_range)]
+        corners = model.vertices[boundary(tets)[0]].astype(np.float64)
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+        length = float(np.quantile(edges, 0.9))
+        # The ball that stands on an equilateral triangle's corners, its middle in their plane.
+        small = {item.name: _thickness(item) for item in solids if _thickness(item) < length / math.sqrt(3.0)}
+        if small:
+            name, size = min(small.items(), key=lambda pair: pair[1])
+            log.warning(
+                "%s (half thickness %.3g m) may sink in between vertices of body %r, whose triangles have "
+                "edges of %.3g m: give it more `tets`", name, size, body.name, length,
+            )  # fmt: skip
+
+
+def _thickness(solid: Collider) -> float:
+    """Half of the middle one of a solid's three extents, m: what a plate's edge or a rod has is the least."""
+    if solid.kind == "plane":
+        return math.inf
+    if solid.vertices is not None:
+        return float(np.sort(np.ptp(solid.vertices, axis=0))[1]) / 2.0
+    return float(np.sort(solid.size)[1]) if solid.kind == "box" else solid.size[0]
 
 
 __all__ = ["as_part", "compile_coupled", "coupled_supports", "part_of", "rigid_links"]

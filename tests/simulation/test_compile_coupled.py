@@ -89,6 +89,15 @@ def test_one_model_of_all_in_the_order_of_the_scene(ball: Asset, caplog: pytest.
     assert all(isinstance(body, RigidBody) for body in model.mujoco.bodies)
 
 
+@pytest.mark.parametrize("size", [0.4, 0.02])
+def test_tells_of_what_fits_between_vertices(
+    ball: Asset, size: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        compiled(ball, {**RIGID, "size": size}, {"position": [0.5, 0, 0]})
+    assert ("b0 (half thickness" in caplog.text and "more `tets`" in caplog.text) == (size < 0.1)
+
+
 def test_frames_of_a_ball_that_a_jelly_holds_up(ball: Asset) -> None:
     scene = scene_of(
         {**RIGID, "position": [0, 0, 0.2]},

@@ -11,6 +11,7 @@ from gdpro_sim.materials import Material
 from gdpro_sim.simulation.coupled import SolverCoupled
 from gdpro_sim.simulation.model import Ground
 from gdpro_sim.simulation.mpm import SolverMPM
+from gdpro_sim.simulation.mpm.boundaries import Obstacles
 from gdpro_sim.simulation.verification.coupling_models import (
     ball,
     coupled,
@@ -72,11 +73,12 @@ def one_solver() -> Iterator[Check]:
     solid = together.coupling.links[0].colliders[0]
     free = replace(solid, mass=body.mass, velocity=body.velocity)
     alone = SolverMPM(replace(model, colliders=(free,)))
+    obstacles = next(item for item in alone.boundaries if isinstance(item, Obstacles))
     off, most = 0.0, 0.0
     for _ in range(100):
         together.step(1e-3)
         alone.step(1e-3)
-        own = alone.boundaries[-1].bodies.velocities[0]
+        own = obstacles.bodies.velocities[0]
         change = own - np.asarray(body.velocity)
         off = max(off, float(np.linalg.norm(momentum(together, "mujoco")[:3] / body.mass - own)))
         most = max(most, float(np.linalg.norm(change)))
