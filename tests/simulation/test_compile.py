@@ -72,7 +72,7 @@ def test_placement(ball: Asset) -> None:
     [
         ({"solver": {"kind": "mpm"}, "wind": {}}, "wind: the MPM solver has none"),
         ({"solver": {"kind": "mpm"}, "body": {"pressures": {"pressure": 1}}}, "pressures: the MPM solver"),
-        ({"body": {"material": "sand"}}, "kind: mpm"),
+        ({"body": {"material": "sand"}}, "flows, which FEM cannot simulate"),
         ({"body": {"particles": 9}}, "`particles` belongs to MPM"),
         ({"body": {"pins": {"side": "top", "start": 1}}}, r"pins\[0\].start: belongs to MPM"),
         (
