@@ -72,7 +72,7 @@ def head_on() -> Iterator[Check]:
         before, energy, start = total_momentum(solver), total_energy(solver), pair.middle()
         speed = float(np.linalg.norm(before[:3]))
         off, turned, aside, risen, missed = 0.0, 0.0, 0.0, 0.0, 0
-        for _ in range(80):
+        for _ in range(60):
             solver.step(STEP)
             change = np.abs(total_momentum(solver) - before)
             off, turned = max(off, change[:3].max() / speed), max(turned, change[3:].max() / (0.06 * speed))
@@ -100,6 +100,7 @@ def _slowed(pair: Pair) -> float:
     "drop",
     title="A ball of 1.8 kg falls 0.3 m on a jelly block of 8 kg on the ground",
     source="momentum changes by the impulses of gravity and of the ground",
+    slow=True,
 )
 def drop() -> Iterator[Check]:
     lines = list(drop_on_jelly())
@@ -112,6 +113,7 @@ def drop() -> Iterator[Check]:
     "rest",
     title="A ball comes to rest on jelly: as heavy, and of a tenth of the jelly's density",
     source="the jelly bears m g of the ball, the ground (m + M) g",
+    slow=True,
 )
 def rest() -> Iterator[Check]:
     for density in (1000.0, 100.0):
@@ -168,6 +170,7 @@ def plate() -> Iterator[Check]:
     "bounce",
     title="A plate of 5 kg on a soft column: up and down as a mass on an elastic bar",
     source="b tan b = M / m, angular frequency b sqrt(E / density) / L (Rao, section 8.3)",
+    slow=True,
 )
 def bounce() -> Iterator[Check]:
     young, density, edge, length = 2e4, 200.0, 0.2, 0.2
