@@ -57,7 +57,7 @@ def main() -> None:
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         kept = ""
-        if "simulate" in sys.argv:
+        if "simulate" in sys.argv or "animate" in sys.argv:
             kept = "; finished frames are kept, the same command continues"
         elif "rollout" in sys.argv:
             kept = "; finished rollouts are kept, the same command continues"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gdpro_sim.asset import Asset
-from gdpro_sim.errors import RequestError
+from gdpro_sim.errors import MeshError, RequestError
 from gdpro_sim.files import prepare_folder
 from gdpro_sim.io.record import Progress, Recording, record
 from gdpro_sim.simulation.animation import VertexSource, open_motion, save_motion
@@ -95,7 +95,11 @@ def animation_scene(
     path = _file(motion if motion is not None else asset, output, "motion.npz")
     moved = path if motion is None else _file(asset, output, "still.usdc")
     numbered = float(fps) if fps is not None and path.is_dir() else None
-    opened = open_motion(path, fps=numbered, clip=clip, up=up, scale=scale)
+    try:
+        opened = open_motion(path, fps=numbered, clip=clip, up=up, scale=scale)
+    except MeshError as error:
+        hint = "" if motion is not None else "; or give the motion in a file of its own"
+        raise MeshError(f"{error}{hint}") from error
     first = opened.begin if start is None else start
     last = opened.end if end is None else end
     if not opened.begin - 1e-9 <= first < last <= opened.end + 1e-9:

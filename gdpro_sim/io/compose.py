@@ -69,6 +69,8 @@ class Composition(Options):
 def load_composition(file: str | Path) -> Composition:
     """Read a composition from YAML; paths in it start at its folder. Raises SceneError."""
     path = Path(file).expanduser()
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise SceneError(f"{path}: a composition is a .yaml file; assets and meshes go into its `parts`")
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

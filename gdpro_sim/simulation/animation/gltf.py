@@ -129,10 +129,12 @@ class _Scene:
         if scenes:
             roots = scenes[self.file.json.get("scene", 0)].get("nodes", [])
         waiting = list(reversed(roots))
+        met: set[int] = set()
         while waiting:
             node = waiting.pop()
-            if node in self.order:
+            if node in met:
                 raise MeshError(f"{self.file.path}: node {node} has two parents; the file is damaged")
+            met.add(node)
             self.order.append(node)
             for child in reversed(nodes[node].get("children", [])):
                 self.parents[child] = node
