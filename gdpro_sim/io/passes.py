@@ -41,4 +41,13 @@ def write_exr(path: str | Path, image: np.ndarray) -> None:
         temporary.write_bytes(done.stdout)
 
 
-__all__ = ["PASSES", "check_passes", "write_exr"]
+def remove_passes_from(folder: Path, count: int) -> None:
+    """Delete the passes of frame `count` and later: they belong to an earlier, longer run of this folder."""
+    for name in (*PASSES, "passes"):
+        for old in folder.glob(f"{name}_*.*"):
+            number = old.stem.removeprefix(f"{name}_")
+            if number.isdigit() and old.suffix in (".exr", ".npz") and int(number) >= count:
+                old.unlink()
+
+
+__all__ = ["PASSES", "check_passes", "remove_passes_from", "write_exr"]

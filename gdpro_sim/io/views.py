@@ -19,7 +19,7 @@ from gdpro_sim.files import atomic_write, prepare_folder, remove_stale
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.images import frame_name, read_png, remove_frames_from, write_png, write_video
 from gdpro_sim.io.obstacles import Obstacles
-from gdpro_sim.io.passes import check_passes, write_exr
+from gdpro_sim.io.passes import check_passes, remove_passes_from, write_exr
 from gdpro_sim.io.preview import Renderer, Studio
 from gdpro_sim.io.staging import Scenery, Staging, named_cameras
 from gdpro_sim.io.turntable import studio_around, turntable_cameras
@@ -159,6 +159,7 @@ def render_file(
                 write_exr(folder / f"{what}_{index:05d}.exr", image)
         report("render", len(written), total)
     remove_frames_from(folder, total)
+    remove_passes_from(folder, total if wanted else 0)
     if video:
         write_video(folder / "preview.mp4", (read_png(picture) for picture in written), rate)
     return written

@@ -137,9 +137,9 @@ LIGHTS: dict[str, list[dict[str, Any]]] = {
         {"kind": "dome", "intensity": 0.07, "color": "#7f93d6"},
     ],
     "three-point": [
-        _distant(-45.0, 42.0, 0.85, softness=5.0, color="#fff1de"),
+        _distant(-45.0, 42.0, 0.76, softness=5.0, color="#fff1de"),
         _distant(55.0, 25.0, 0.28, softness=20.0, color="#d6e4ff"),
-        _distant(165.0, 38.0, 0.75, softness=4.0),
+        _distant(165.0, 38.0, 0.55, softness=4.0),
         {"kind": "dome", "intensity": 0.12},
     ],
 }
