@@ -30,14 +30,14 @@ from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_o
 from gdpro_sim.io.perception import CHANNELS, Photographer
 from gdpro_sim.io.record import fingerprint
 from gdpro_sim.simulation.callbacks import callbacks_of, with_code
-from gdpro_sim.simulation.compile import check_files, load_assets
+from gdpro_sim.simulation.compile import check_files, check_supported, load_assets
 from gdpro_sim.simulation.effects import check_effects
 from gdpro_sim.simulation.mujoco.batch import run_batch
 from gdpro_sim.simulation.mujoco.solver import SolverMuJoCo
 from gdpro_sim.simulation.mujoco.trajectory import BACKGROUND, FLOOR, Layout, Trajectory
 from gdpro_sim.simulation.mujoco_model import SoftBody
 from gdpro_sim.simulation.mujoco_options import MujocoOptions
-from gdpro_sim.simulation.placement import material_of, place
+from gdpro_sim.simulation.placement import material_of
 from gdpro_sim.simulation.randomize import Variations, draw, expand
 from gdpro_sim.simulation.run import Simulation
 from gdpro_sim.simulation.scene import Scene, check_scene, load_scene
@@ -165,6 +165,7 @@ def rollout(
         raise RequestError("give at least one channel, or `images` none")
     expand(checked, checked.randomize)
     checked = with_code(checked, allow_code)
+    check_supported(checked)
     check_files(checked)
     device = resolve_device(device)
     before, wanted = thread_count(), threads or thread_count()
@@ -495,17 +496,14 @@ def _some(plan: _Plan, indices: list[int], seconds: dict[str, float]) -> Iterato
         except SceneError as error:
             raise SceneError(f"rollout {index}: {error}; narrow its ranges (drawn: {values})") from None
         assert isinstance(simulation.solver, SolverMuJoCo)
-        placed = [place(scene, body, plan.assets[body.name]) for body in scene.bodies]
-        poses = [(item.turn, item.shift) for item in placed]
+        placed = [body.placement for body in simulation.model.bodies]
+        poses = [(item.turn, item.shift) for item in placed if item is not None]
         simulations.append(simulation)
         solvers.append(simulation.solver)
         trajectories.append(Trajectory(simulation.solver, plan.layout, poses))
         drawn.append(values)
-        scales.append(
-            np.array(
-                [_scale(p.asset, plan.assets[b.name]) for p, b in zip(placed, scene.bodies, strict=True)]
-            )
-        )
+        pairs = zip(scene.bodies, placed, strict=True)
+        scales.append(np.array([_scale(p.asset, plan.assets[b.name]) for b, p in pairs if p is not None]))
     surfaces: list[dict[int, list[np.ndarray]]] = [{} for _ in indices]
     poses_seen: list[dict[int, np.ndarray | None]] = [{} for _ in indices]
 
