@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+import re
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -40,8 +42,21 @@ WARNINGS = {
 UNCONVERGED = mujoco.mjtWarning.mjWARN_INERTIA
 """Says that the elasticity of a flex was not solved to its tolerance, too."""
 
-# MuJoCo would print its warnings, and write them to a file where the program runs.
-mujoco.set_mju_user_warning(lambda text: log.debug("MuJoCo: %s", " ".join(str(text).split())))
+ELASTIC = 1e-4
+"""Relative residual of a flex's elasticity that will do; MuJoCo warns from 1e-6 on."""
+
+_warned = threading.local()
+
+
+def _note(text: str) -> None:
+    """MuJoCo would print its warnings, and write them to a file where the program runs."""
+    log.debug("MuJoCo: %s", " ".join(str(text).split()))
+    found = re.search(r"relative residual of ([0-9.e+-]*[0-9])", str(text))
+    if found:
+        _warned.residual = float(found[1])
+
+
+mujoco.set_mju_user_warning(_note)
 
 
 @dataclass
@@ -147,11 +162,15 @@ class SolverMuJoCo:
             except SolverError:
                 mujoco.mj_setState(model, data, before, STATE)
                 raise
+            _warned.residual = 1.0  # what it is is said once, until the number of warnings is put back
+            data.warning[int(UNCONVERGED)].number = 0
             mujoco.mj_step(model, data)
+            if data.warning[int(UNCONVERGED)].number:
+                result.residual = max(result.residual, _warned.residual)
             rounds = int(np.max(data.solver_niter)) if data.nefc else 0
             result.iterations += rounds
             result.converged &= rounds < model.opt.iterations
-        result.converged &= data.warning[int(UNCONVERGED)].number == 0
+        result.converged &= result.residual <= ELASTIC
         self._drive(begin + dt, 0.0)
         bad = next((text for kind, text in WARNINGS.items() if data.warning[int(kind)].number), None)
         if bad is None and not (np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()):
