@@ -7,7 +7,8 @@ from gdpro_sim.asset.stage import is_asset, kind
 
 __all__ = [
     "Asset",
-    "ComposedPart", "bind_asset",
+    "ComposedPart",
+    "bind_asset",
     "compose",
     "import_mesh",
     "is_asset",
