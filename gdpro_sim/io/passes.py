@@ -46,7 +46,8 @@ def remove_passes_from(folder: Path, count: int) -> None:
     for name in (*PASSES, "passes"):
         for old in folder.glob(f"{name}_*.*"):
             number = old.stem.removeprefix(f"{name}_")
-            if number.isdigit() and old.suffix in (".exr", ".npz") and int(number) >= count:
+            ours = len(number) == 5 and number.isdigit() and old.suffix in (".exr", ".npz")
+            if ours and int(number) >= count:
                 old.unlink()
 
 
