@@ -123,7 +123,7 @@ def written(folder: Path, callback: str = "moves.py:lift", code: str = MOVES, **
     plate = {"kind": "box", "size": [1, 1, 0.1], "position": [0, 0, 0.2], "motion": {"callback": callback}}
     body = {"asset": "cube.ply", "position": [0, 0, 0.3], "budget": 300, "mujoco": {"shape": "box"}}
     described = {
-        "name": "s", "bodies": body, "colliders": plate, "solver": {"kind": "mujoco"}, "duration": 0.2,
+        "name": "s", "bodies": body, "colliders": plate, "solver": {"kind": "mujoco"}, "duration": 0.15,
         "fps": 20, "folder": folder, "camera": {"width": 64, "height": 48},
     }  # fmt: skip
     return check_scene(described | scene)
@@ -185,16 +185,16 @@ def test_the_command_line_names_the_flag(tmp_path: Path, monkeypatch: Any, capsy
 
 
 def test_a_failing_run_keeps_its_frames_and_a_changed_file_starts_anew(tmp_path: Path, caplog: Any) -> None:
-    code = "def lift(t):\n    assert t < 0.16, 'too late'\n    return (0, 0, t), (0, 0, 0)\n"
-    with pytest.raises(SolverError, match=r"moves.py:lift at 0.1\d+ s raised AssertionError: .*line 2\)"):
+    code = "def lift(t):\n    assert t < 0.06, 'too late'\n    return (0, 0, t), (0, 0, 0)\n"
+    with pytest.raises(SolverError, match=r"moves.py:lift at 0.0\d+ s raised AssertionError: .*line 2\)"):
         record(written(tmp_path, code=code), tmp_path / "out", allow_code=True)
-    assert len(list((tmp_path / "out/frames").glob("*.png"))) == 4
-    assert len(SimulationReader(tmp_path / "out/simulation.usdc")) == 4
-    again = code.replace("0.16", "9").replace("t), (0", "2 * t), (0")
+    assert len(list((tmp_path / "out/frames").glob("*.png"))) == 2
+    assert len(SimulationReader(tmp_path / "out/simulation.usdc")) == 2
+    again = code.replace("0.06", "9").replace("t), (0", "2 * t), (0")
     done = record(written(tmp_path, code=again), tmp_path / "out", allow_code=True)
     assert done.resumed_frames == 0 and "another scene" in caplog.text
     poses = [frame.colliders for frame in SimulationReader(done.simulation)]
-    np.testing.assert_allclose([pose[0, 2, 3] for pose in poses if pose is not None], 0.1 * np.arange(5))
+    np.testing.assert_allclose([pose[0, 2, 3] for pose in poses if pose is not None], 0.1 * np.arange(4))
     (tmp_path / "moves.py").unlink()  # pictures are made again without it
     pictures = render_file(done.simulation, tmp_path / "again")
     for picture in pictures:
