@@ -34,7 +34,7 @@ bodies:
 colliders:
   - {kind: box, name: wall, size: [0.05, 0.6, 0.3], position: [-0.4, 0, 0.15]}
 fps: 20
-duration: 0.3
+duration: 0.2
 solver: {kind: mujoco}
 camera: {width: 96, height: 72, target: [0, 0, 0.1], distance: 1.6}
 randomize:
@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     asset = import_mesh(write_obj(path / "ball.obj", *sphere(4, RADIUS)), budget=4000, tets=False)
     tetrahedralize_asset(asset, target_tets=200, method="lattice").save(path / "ball.usdc")
     (path / "scene.yaml").write_text(SCENE)
-    rollout(path / "scene.yaml", path / "made", count=2, cameras=2, images=6, threads=1)
+    rollout(path / "scene.yaml", path / "made", count=2, cameras=2, threads=1)
     return path
 
 
@@ -95,7 +95,7 @@ def test_a_rollout_is_the_run_of_its_scene(folder: Path) -> None:
         np.testing.assert_allclose(
             np.einsum("vw,vwc->vc", soft["embedding_weights"], corners), jelly, atol=1e-6
         )
-    assert arrays["time"][-1] == pytest.approx(0.3)
+    assert arrays["time"][-1] == pytest.approx(0.2)
     centre = ball.min(axis=0) / 2 + ball.max(axis=0) / 2
     np.testing.assert_allclose(arrays["centers"][-1, 0], centre, atol=5e-4)
 
@@ -129,10 +129,10 @@ def test_contacts_carry_weight_and_name_what_touches(folder: Path) -> None:
 def test_pictures_agree_with_states_through_the_cameras(folder: Path) -> None:
     about = json.loads((folder / "made/dataset.json").read_text())
     whole = 0
-    assert about["images"]["cameras"] == ["main", "main_1"] and about["images"]["frames"] == [0, 6]
+    assert about["images"]["cameras"] == ["main", "main_1"] and about["images"]["frames"] == [4]
     for index in range(2):
         record, arrays, pictures = read(folder / "made", index)
-        assert len(pictures) == 2 * 2 * 3
+        assert len(pictures) == 2 * 3
         radius = 0.5 * record["parameters"]["bodies.ball.size"]
         for f, frame in enumerate(about["images"]["frames"]):
             for c, camera in enumerate(about["images"]["cameras"]):
@@ -157,7 +157,7 @@ def test_pictures_agree_with_states_through_the_cameras(folder: Path) -> None:
                 rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]) * depth[y, x]
                 world = view[:3, :3].T @ (np.linalg.inv(k) @ rays - view[:3, 3:])
                 assert np.abs(world[2]).max() < 2e-3
-    assert whole >= 4
+    assert whole >= 2
 
 
 def test_the_table_holds_what_was_drawn(folder: Path) -> None:
@@ -173,14 +173,14 @@ def test_the_table_holds_what_was_drawn(folder: Path) -> None:
         ]
         assert float(row["camera.azimuth"]) == table["camera.azimuth"][index]
         assert row["camera.azimuth#1"] != row["camera.azimuth"]
-        assert (row["frames"], row["error"]) == ("7", "")
+        assert (row["frames"], row["error"]) == ("5", "")
 
 
 def test_threads_do_not_change_a_byte_and_datasets_grow(folder: Path) -> None:
     grown = folder / "grown"
-    rollout(folder / "scene.yaml", grown, count=1, cameras=2, images=6, threads=2)
-    made = rollout(folder / "scene.yaml", grown, count=2, cameras=2, images=6, threads=2)
-    assert (made.resumed, made.count, made.pictures) == (1, 2, 12)
+    rollout(folder / "scene.yaml", grown, count=1, cameras=2, threads=2)
+    made = rollout(folder / "scene.yaml", grown, count=2, cameras=2, threads=2)
+    assert (made.resumed, made.count, made.pictures) == (1, 2, 6)
     assert files_of(grown) == files_of(folder / "made")
 
 
@@ -196,18 +196,18 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(folder: Path, monkeypatch: pyte
 
     def stopping(path: Path, picture: np.ndarray) -> None:
         calls.append(path)
-        if len(calls) == 17:  # in the second rollout
+        if len(calls) == 8:  # in the second rollout
             raise Stopped
         whole(path, picture)
 
     monkeypatch.setattr(perception, "write_png", stopping)
     with pytest.raises(Stopped):
-        rollout(folder / "scene.yaml", target, count=2, cameras=2, images=6)
+        rollout(folder / "scene.yaml", target, count=2, cameras=2)
     assert not json.loads((target / "dataset.json").read_text())["complete"]
     kept = files_of(target / "rollouts/00000")
     monkeypatch.setattr(perception, "write_png", whole)
     (target / "rollouts/00001/.main.0123456789ab.tmp.png").write_bytes(b"cut off")
-    made = rollout(folder / "scene.yaml", target, count=2, cameras=2, images=6)
+    made = rollout(folder / "scene.yaml", target, count=2, cameras=2)
     assert made.resumed == 1 and files_of(target / "rollouts/00000") == kept
     assert files_of(target) == files_of(folder / "made")
 
@@ -229,7 +229,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(folder: Path, monkeypatch: pyte
 def test_wrong_requests_are_told_before_anything_runs(
     folder: Path, options: dict[str, Any], message: str
 ) -> None:
-    given = {"scene": folder / "scene.yaml", "count": 2, "cameras": 2, "images": 6, **options}
+    given = {"scene": folder / "scene.yaml", "count": 2, "cameras": 2, **options}
     before = files_of(folder / "made")
     with pytest.raises(GdproError, match=message):
         rollout(given.pop("scene"), folder / "made", **given)

@@ -69,21 +69,21 @@ def test_draws_lie_within_their_ranges_and_fill_them() -> None:
         "gravity.z": {"low": 0.5, "high": 1.5, "apply": "scale"},
         "bodies.left.material.friction": {"choices": [0.1, 0.2, 0.3]},
     })  # fmt: skip
-    found = drawn(scene, 600)
+    found = drawn(scene, 300)
     places = np.array([values["bodies.left.position"] for values in found])
     assert (places >= [-1, 0, 2]).all() and (places <= [1, 4, 3]).all()
-    np.testing.assert_allclose(places.mean(axis=0), [0.0, 2.0, 2.5], atol=0.15)
-    np.testing.assert_allclose(places.std(axis=0), np.array([2.0, 4.0, 1.0]) / np.sqrt(12.0), rtol=0.08)
-    assert np.abs(np.corrcoef(places.T) - np.eye(3)).max() < 0.12
+    np.testing.assert_allclose(places.mean(axis=0), [0.0, 2.0, 2.5], atol=0.2)
+    np.testing.assert_allclose(places.std(axis=0), np.array([2.0, 4.0, 1.0]) / np.sqrt(12.0), rtol=0.12)
+    assert np.abs(np.corrcoef(places.T) - np.eye(3)).max() < 0.17
     density = np.array(
         [[values[f"bodies.{n}.material.density"] for n in ("left", "right")] for values in found]
     )
-    assert np.median(density) == pytest.approx(100.0, rel=0.2)
-    assert abs(np.corrcoef(np.log(density.T))[0, 1]) < 0.12
+    assert np.median(density) == pytest.approx(100.0, rel=0.35)
+    assert abs(np.corrcoef(np.log(density.T))[0, 1]) < 0.17
     gravity = np.array([values["gravity.z"] for values in found])
     assert -14.72 < gravity.min() < gravity.max() < -4.9
     friction = [values["bodies.left.material.friction"] for values in found]
-    assert min(friction.count(value) for value in (0.1, 0.2, 0.3)) > 160
+    assert min(friction.count(value) for value in (0.1, 0.2, 0.3)) > 75
 
 
 def test_any_rotation_prefers_no_direction() -> None:
@@ -92,8 +92,8 @@ def test_any_rotation_prefers_no_direction() -> None:
     found = drawn(scene_of({"bodies.left.rotation": "any"}), 500)
     angles = [values["bodies.left.rotation"] for values in found]
     matrices = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-    assert np.abs(matrices.mean(axis=0)).max() < 0.1
-    np.testing.assert_allclose((matrices**2).mean(axis=0), 1.0 / 3.0, atol=0.06)
+    assert np.abs(matrices.mean(axis=0)).max() < 0.12
+    np.testing.assert_allclose((matrices**2).mean(axis=0), 1.0 / 3.0, atol=0.08)
 
 
 def test_a_draw_depends_on_seed_number_and_path_alone() -> None:
@@ -203,8 +203,8 @@ def test_rollouts_are_what_the_solver_does_alone(ball: Asset, kind: str, tmp_pat
         keys = [{"time": 0.0, "value": 0.0}, {"time": 0.3, "value": 0.8}]
         given["solver"] = {"kind": "mujoco", "base": str(tmp_path / "arm.xml"), "controls": {"turn": keys}}
     if kind == "moved":
-        motion = [{"time": 0.2, "translation": [0.3, 0, 0]}]
-        given["duration"] = 0.2
+        motion = [{"time": 0.1, "translation": [0.15, 0, 0]}]
+        given["duration"] = 0.1
         given["colliders"] = [
             {"kind": "box", "size": [0.1, 0.4, 0.4], "position": [-0.6, 0, 0.2], "motion": motion}
         ]
@@ -219,10 +219,10 @@ def test_rollouts_are_what_the_solver_does_alone(ball: Asset, kind: str, tmp_pat
         bodies = [body.model_copy(update={"mujoco": None, "material": JELLY}) for body in scene.bodies]
         scene = scene.model_copy(update={"bodies": tuple(bodies), "duration": 0.1})
     variations = expand(scene, scene.randomize)
-    scenes = [draw(scene, variations, 0, index)[0] for index in range(3)]
+    scenes = [draw(scene, variations, 0, index)[0] for index in range(2)]
     failures, one = run(scenes, ball, threads=1)
-    assert failures == [None] * 3
-    assert len(one) == 3 * scene.frame_count and len(set(one.values())) == len(one)
+    assert failures == [None] * 2
+    assert len(one) == 2 * scene.frame_count and len(set(one.values())) == len(one)
     _, two = run(scenes, ball, threads=2)
     assert one == two
     for k, changed in enumerate(scenes):
