@@ -26,6 +26,7 @@ from gdpro_sim.materials import Material
 from gdpro_sim.meshing.convex import ConvexPieces
 from gdpro_sim.meshing.repair import signed_volume
 from gdpro_sim.simulation.compile import compile_scene, load_assets
+from gdpro_sim.simulation.mujoco_model import RigidBody
 from gdpro_sim.simulation.scene import check_scene
 from gdpro_sim.splatting import rasterization
 from tests.asset.sample import assert_same, make_asset, make_bound, sphere
@@ -153,7 +154,7 @@ def test_overlapping_parts_become_one_body_of_two_materials(caplog: pytest.LogCa
     again = np.einsum("vw,vwc->vc", whole.embedding.weights, corners)
     assert np.allclose(again, whole.gaussians.vertices.numpy(), atol=1e-4), "buried vertices as well"
 
-    scene = {"bodies": [{"name": "man", "asset": "x", "anchor": "origin"}], "ground": None}
+    scene: dict[str, Any] = {"bodies": [{"name": "man", "asset": "x", "anchor": "origin"}], "ground": None}
     jelly, rubber = (np.float32(Material.model_validate(name).young) for name in ("jelly", "rubber"))
 
     def off(points: np.ndarray) -> np.ndarray:
@@ -169,6 +170,11 @@ def test_overlapping_parts_become_one_body_of_two_materials(caplog: pytest.LogCa
     young = np.array([m.young for m in mpm.particles.materials], np.float32)[mpm.particles.matter]
     apart = off(mpm.particles.positions)
     assert (young[apart < 0.7] == rubber).all() and (young[apart > 0.9] == jelly).all()
+    scene["bodies"][0]["mujoco"] = {"form": "rigid", "shape": "sphere"}
+    rigid = compile_scene(check_scene({**scene, "solver": {"kind": "mujoco"}}), {"man": whole}).mujoco
+    assert rigid is not None and isinstance(rigid.bodies[0], RigidBody)
+    mass = float(whole.tets.volumes().sum()) * Material.model_validate("jelly").density
+    assert rigid.bodies[0].mass == pytest.approx(mass, rel=1e-6), "what overlaps weighs once"
 
 
 @pytest.mark.parametrize(
