@@ -618,3 +618,13 @@ def test_a_thin_collider_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
     shelf = collider(kind="box", name="shelf", size=(1.0, 1.0, 0.05), position=(0.0, 0.0, -0.1))
     SolverMPM(block(colliders=(shelf,))).step(1e-3)
     assert "'shelf' is 0.05 m thick" in caplog.text
+
+
+@pytest.mark.parametrize("others", [0, 1])
+def test_free_bodies_that_would_pass_through_others_are_told_of(
+    caplog: pytest.LogCaptureFixture, others: int
+) -> None:
+    ball = collider(kind="sphere", name="ball", radius=0.3, position=(0.0, 0.0, 1.0), mass=1.0)
+    post = collider(kind="box", name="post", size=(0.4, 0.4, 2.0), position=(1.0, 0.0, 0.0))
+    run(SolverMPM(block(colliders=(ball, *[post] * others), ground=Ground())), 0.01, 0.01)
+    assert ("ball, post" in caplog.text and "coupled" in caplog.text) == bool(others)

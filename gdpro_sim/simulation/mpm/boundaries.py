@@ -394,10 +394,17 @@ class Obstacles:
                 break
 
     def _warn(self, spacing: float) -> None:
-        """Say which obstacles are too thin to keep matter out."""
+        """Say which obstacles are too thin to keep matter out, and which pass through each other."""
         if self._warned:
             return
         self._warned = True
+        solid = [item.name for item in self.items if item.kind != "plane"]
+        if self._body_of and len(solid) > 1:
+            log.warning(
+                "colliders with a mass meet matter and planes, but pass through each other and other "
+                "colliders (%s): for more, make them rigid bodies of a scene with `solver: {kind: coupled}`",
+                ", ".join(solid),
+            )
         for item in self.items:
             thickness = 2.0 * item.room / ROOM
             if item.kind not in ("plane", "mesh") and thickness < 2.0 * spacing:

@@ -91,6 +91,35 @@ def hydrostatic() -> Iterator[Check]:
     yield at_most("fastest particle", 2e-2, np.abs(solver.velocities).max(), "m/s")
 
 
+@problem(
+    "sloshing",
+    title="A column of water falls over in a tank, one cell thick, and comes to rest: its volume",
+    source="conservation of volume",
+)
+def sloshing() -> Iterator[Check]:
+    column, high, tank, dx = 0.2, 0.4, 0.4, 0.025
+    model = make_model(
+        sheet(column, high, dx),
+        _water(math.sqrt(2.0 * GRAVITY * high), 5.0, rayleigh_mass=2.0),
+        dx=dx,
+        gravity=(0.0, 0.0, -GRAVITY),
+        ground=Ground(),
+        domain=between_walls(dx, 0.0, tank),
+    )
+    solver, highest = SolverMPM(model), 0.0
+    for _ in range(16):
+        solver.step(0.1)
+        highest = max(highest, float(solver.positions[:, 2].max()))
+    middle = []
+    for _ in range(6):
+        solver.step(0.1)
+        middle.append(float(solver.positions[:, 2].mean()))
+    depth = high * column / tank
+    yield at_least("highest splash / depth", 1.6, highest / depth)
+    volume = 2.0 * float(np.mean(middle)) / depth
+    yield relative("volume, from the middle's height, mean of 0.6 s", 1.0, volume, 0.05)
+
+
 def _dam(cells: int) -> tuple[np.ndarray, np.ndarray, float]:
     """(front / that of the experiment, height - that of the experiment, largest rise of energy / energy)."""
     a = 1.0
@@ -233,6 +262,6 @@ def plug_flow() -> Iterator[Check]:
     )
 
 
-PROBLEMS = (hydrostatic, dam_break, dam_break_fine, poiseuille, plug_flow)
+PROBLEMS = (hydrostatic, sloshing, dam_break, dam_break_fine, poiseuille, plug_flow)
 
 __all__ = ["PROBLEMS"]
