@@ -25,7 +25,7 @@ from gdpro_sim.io.staging import Scenery, Staging, named_cameras
 from gdpro_sim.io.turntable import studio_around, turntable_cameras
 from gdpro_sim.io.usd import SimulationReader
 from gdpro_sim.simulation.callbacks import Callback
-from gdpro_sim.simulation.colliders import compile_collider
+from gdpro_sim.simulation.colliders import Collider, compile_collider
 from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.scene import Scene, check_scene, read_mapping
 from gdpro_sim.simulation.view import MAIN
@@ -236,11 +236,11 @@ def _with_render(studio: Studio, scene: Scene) -> Studio:
 
 
 def _obstacles(reader: SimulationReader, device: str) -> Obstacles:
-    """What the bodies of a recorded scene meet; meshes as far as their files are still found."""
+    """What the bodies of a recorded scene meet, as far as its files are still found, and parts of a base."""
     scene, preview = reader.metadata.get("scene"), reader.metadata.get("preview")
-    if scene is None or preview is None or not scene.get("colliders"):
+    if scene is None or preview is None or not (scene.get("colliders") or reader.links):
         return Obstacles((), np.zeros(3), np.ones(3), device)
-    colliders = []
+    colliders: list[Collider] = []
     for options in Scene.model_validate(scene).colliders:
         if isinstance(options.motion, Callback):  # the frames say where it was: no code runs here
             options = options.model_copy(update={"motion": ()})
@@ -248,7 +248,8 @@ def _obstacles(reader: SimulationReader, device: str) -> Obstacles:
             colliders.append(compile_collider(options, lambda file: Path(reader.path).parent / file))
         except MeshError as error:
             logger.warning("a collider is not drawn: %s", error)
-    return Obstacles(colliders, np.asarray(preview["low"]), np.asarray(preview["high"]), device)
+            colliders.append(Collider(options.name, "box", visible=False))  # poses go by number
+    return Obstacles([*colliders, *reader.links], np.asarray(preview["low"]), np.asarray(preview["high"]), device)
 
 
 def gaussians_of(file: str | Path, frame: int = 0) -> Gaussians:
