@@ -249,7 +249,9 @@ def _obstacles(reader: SimulationReader, device: str) -> Obstacles:
         except MeshError as error:
             logger.warning("a collider is not drawn: %s", error)
             colliders.append(Collider(options.name, "box", visible=False))  # poses go by number
-    return Obstacles([*colliders, *reader.links], np.asarray(preview["low"]), np.asarray(preview["high"]), device)
+    return Obstacles(
+        [*colliders, *reader.links], np.asarray(preview["low"]), np.asarray(preview["high"]), device
+    )
 
 
 def gaussians_of(file: str | Path, frame: int = 0) -> Gaussians:
