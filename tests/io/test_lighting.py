@@ -160,14 +160,17 @@ def test_caught_shadows_lie_where_the_floors_do() -> None:
 def test_cameras_in_turn_and_again_give_the_same_bytes() -> None:
     bound = ball()
     g, normals = bound.gaussians(), bound.normals()
-    other = frame_camera([-1, -1, 0], [1, 1, 1], azimuth=80, elevation=40, fov=30, width=160, height=120)
-    fresh = [Renderer(one, Studio(scale=0.4, azimuth=-60.0)).render(g, normals) for one in (CAMERA, other)]
+    small = {"fov": 30, "width": 64, "height": 48}
+    front, other = (
+        frame_camera([-1, -1, 0], [1, 1, 1], azimuth=azimuth, elevation=40, **small) for azimuth in (-60, 80)
+    )
+    fresh = [Renderer(one, Studio(scale=0.4, azimuth=-60.0)).render(g, normals) for one in (front, other)]
     renderer = Renderer(studio=Studio(scale=0.4, azimuth=-60.0))
     for _ in range(3):  # not kept, kept, from what is kept
-        maps = renderer.shadows(g, CAMERA)
-        for one, expected in zip((CAMERA, other), fresh, strict=True):
+        maps = renderer.shadows(g, front)
+        for one, expected in zip((front, other), fresh, strict=True):
             np.testing.assert_array_equal(renderer.render(g, normals, one, maps), expected)
-    for azimuth in range(6):  # cameras that move leave nothing behind
+    for azimuth in range(4):  # cameras that move leave nothing behind
         moved = frame_camera(
             [-1, -1, 0], [1, 1, 1], azimuth=azimuth, elevation=4, fov=30, width=16, height=16
         )
