@@ -190,7 +190,8 @@ def _run(
 ) -> list[dict[str, Any]]:
     """Every frame: solve (or take it from an interrupted run), re-splat, draw, write."""
     total = len(simulation)
-    explicit = simulation.model.particles is not None and simulation.model.mpm.integrator == "explicit"
+    model = simulation.model
+    explicit = model.particles is not None and model.coupling is None and model.mpm.integrator == "explicit"
     rows: list[dict[str, Any]] = []
     report("simulate", 0, total)
     simulation.solver.reset()
