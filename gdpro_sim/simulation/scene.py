@@ -81,7 +81,8 @@ class Scene(Options):
         default=(), description="bodies tied together where they meet"
     )
     randomize: tuple[Variation, ...] = Field(
-        default=(), description="what `gdpro rollout` draws anew for every rollout: a mapping of paths to ranges"
+        default=(),
+        description="what `gdpro rollout` draws anew for every rollout: a mapping of paths to ranges",
     )
     folder: Path = Field(
         default_factory=Path.cwd, exclude=True, description="where relative paths start; set by load_scene"

@@ -101,7 +101,9 @@ def test_wrong_copies_are_refused(copies: Any, message: str) -> None:
 def test_clashing_names_are_listed() -> None:
     others = [{"name": name, "asset": "cube.ply"} for name in ("box_0", "box_2", "box_9")]
     box = {"name": "box", "asset": "cube.ply", "copies": {"count": 3, "spacing": 1}}
-    with pytest.raises(SceneError, match="copies would be named like other bodies: box_0, box_2; rename those"):
+    with pytest.raises(
+        SceneError, match="copies would be named like other bodies: box_0, box_2; rename those"
+    ):
         check_scene({"bodies": [box, *others]})
     with pytest.raises(SceneError, match="two bodies are named 'box'"):
         check_scene({"bodies": [box, {"name": "box", "asset": "cube.ply"}]})
