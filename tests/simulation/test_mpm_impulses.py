@@ -15,8 +15,8 @@ from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.conditions import Guide
 from gdpro_sim.simulation.model import Model, MpmSettings
 from gdpro_sim.simulation.mpm import SolverMPM
+from tests.simulation.mpm_blocks import GRAVITY, block, collider
 from tests.simulation.test_colliders import box_mesh
-from tests.simulation.test_mpm_boundaries import GRAVITY, block, collider
 
 STEP = 0.01
 
