@@ -234,10 +234,12 @@ class Launches:
     Packing costs more than running a small kernel. Belongs to the owner of the arrays, which it keeps alive.
     Numbers may differ from call to call. A struct is packed at its first launch: its arrays may change, but
     not be exchanged for others.
+    serial: keep every launch on one thread, for problems too small to share out
     """
 
     def __init__(self, device: str) -> None:
         self.device = device
+        self.serial = False
         self._recorded: dict[tuple[Any, ...], _Recorded] = {}
 
     def __call__(
@@ -267,7 +269,7 @@ class Launches:
                 self._recorded.clear()
             wp.load_module(kernel.module, device=self.device)
             recorded = self._recorded[tuple(key)] = _Recorded(kernel, arguments, self.device)
-        if self.device != "cpu" or count < 2 * minimum or thread_count() == 1:
+        if self.device != "cpu" or self.serial or count < 2 * minimum or thread_count() == 1:
             recorded.launch(0, count, numbers)
         else:
             recorded.spread(count, min(PIECES * thread_count(), count // minimum), numbers)

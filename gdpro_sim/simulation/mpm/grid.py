@@ -182,6 +182,7 @@ class Grid:
         self.sources = self.set("sources", sources.ravel(), int)
         corners = np.stack(np.unravel_index(nodes, tuple(size)), axis=1) + first
         self.blocks = self.set("blocks", corners.astype(np.int32), wp.vec3i)
+        self.launch.serial = self.occupied < 2 * FEW_BLOCKS
         self.values = self.array("values", 64 * self.count, wp.vec4)
         self.strayed = self.array("strayed", self.occupied, int)
         if self.device == "cpu":
