@@ -1,24 +1,26 @@
 """FEM speed: milliseconds per frame of a 0.5 m box dropped 0.3 m, over mesh size and Young's modulus.
 
     python -m tests.benchmarks.bench_fem [--frames 60] [--threads N] [--device cpu] [--cells 9 15] [--shares]
+        [--integrator bdf2] [--substeps 1]
 
 Prints a Markdown table and the machine it was made on. 60 frames/s, density 1000, poisson 0.4, friction 0.5,
-no damping, default solver settings. The first step (compilation) is not counted. "CPU" is the time of
-all threads together: on a shared machine it differs less from run to run than wall time. `--shares` says
-where the wall time of a frame goes.
+no damping, default solver settings but for the two options. The first step (compilation) is not counted.
+"CPU" is the time of all threads together: on a shared machine it differs less from run to run than wall time.
+`--shares` says where the wall time of a frame goes.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from gdpro_sim import device as devices
 from gdpro_sim.simulation.fem import SolverFEM
-from gdpro_sim.simulation.model import Ground
+from gdpro_sim.simulation.model import FemSettings, Ground
 from tests.benchmarks.machine import machine
 from tests.benchmarks.shares import Shares
 from tests.simulation.fem_models import make_model, tet_box
@@ -39,10 +41,11 @@ def watched(solver: SolverFEM, device: str) -> Shares:
     return watch
 
 
-def measure(cells: int, young: float, frames: int, device: str, shares: bool) -> str:
+def measure(cells: int, young: float, frames: int, device: str, shares: bool, **settings: Any) -> str:
     """One row of the table."""
     vertices, tets = tet_box((cells,) * 3, (0.5,) * 3, (0.0, 0.0, 0.3))
-    solver = SolverFEM(make_model(vertices, tets, young=young, poisson=0.4, ground=Ground(), device=device))
+    material: dict[str, Any] = {"young": young, "poisson": 0.4, "ground": Ground()}
+    solver = SolverFEM(make_model(vertices, tets, **material, device=device, **settings))
     solver.step(1 / 60)
     solver.reset()
     watch = watched(solver, device) if shares else None
@@ -82,12 +85,15 @@ def main() -> None:
     parser.add_argument("--young", type=float, nargs="+", default=[1e4, 1e5, 1e6, 1e7])
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--integrator", default=FemSettings.integrator)
+    parser.add_argument("--substeps", type=int, default=FemSettings.substeps)
     parser.add_argument("--shares", action="store_true", help="add where the time goes")
     options = parser.parse_args()
     if options.threads:
         devices.set_thread_count(options.threads)
     device = devices.resolve_device(options.device)
 
+    settings = {"integrator": options.integrator, "substeps": options.substeps}
     print(f"{machine(device)}\n")
     columns = ["tets", "E, Pa", "ms/frame mean", "median", "worst", "CPU", "substeps", "Newton/frame"]
     columns += ["CG/Newton", "unconverged", *(PARTS if options.shares else ())]
@@ -95,7 +101,8 @@ def main() -> None:
     print("|---" * len(columns) + "|")
     for cells in options.cells:
         for young in options.young:
-            print(measure(cells, young, options.frames, device, options.shares), flush=True)
+            row = measure(cells, young, options.frames, device, options.shares, **settings)
+            print(row, flush=True)
 
 
 if __name__ == "__main__":
