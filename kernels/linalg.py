@@ -4,9 +4,8 @@ Every sum is taken over ranges that depend on the problem's size alone, never on
 results are the same bytes for any thread count. `start` (first argument) is the index of the launch's first
 item, see `gdpro_sim.device.launch_chunked`.
 
-Conjugate gradients come in two forms with the same arithmetic: `cg_serial` runs a whole solve inside one
-launch (no launch overhead: best on the CPU up to some thousand rows), and the `cg_*` steps run one phase per
-launch, spread over CPU threads or a CUDA device, with every scalar kept in device memory.
+The `cg_*` steps run one phase of a solve per launch, spread over CPU threads or a CUDA device, with every
+scalar kept in device memory; `gdpro_sim.kernels.gauss_seidel` has a whole solve inside one launch.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ CG_DONE = wp.constant(4)  # 1: converged, -1: the matrix or the preconditioner i
 CG_ITERATIONS = wp.constant(5)
 
 
-_VECTORS = """
+VECTORS = """
     typedef double D __attribute__((ext_vector_type(4)));
     auto load = [](const double* p) { D v; __builtin_memcpy(&v, p, sizeof(D)); return v; };
     auto store = [](double* p, D v) { __builtin_memcpy(p, &v, sizeof(D)); };
@@ -52,7 +51,7 @@ _VECTORS = """
     }}
     return wp::vec3d(s0, s1, s2);
 #else
-    {_VECTORS}
+    {VECTORS}
     D s0 = (D)0.0, s1 = s0, s2 = s0;
     for (int k = begin; k < end; ++k) {{
         const double* const m = values_ + 9 * (size_t)k;
@@ -192,216 +191,6 @@ def cg_update_row(
     r_out[i] = r
     z_out[i] = z
     return wp.dot(r, z)
-
-
-_CG_SERIAL = f"""
-#if !defined(__CUDACC__)
-    {_VECTORS}
-    const double* const entries = (const double*)values.data;
-    const double* const extra = (const double*)extra_values.data;
-    const double* const inverse = (const double*)inverse_diagonal.data;
-    const double* const b = (const double*)right_hand_side.data;
-    double* const x = (double*)x_out.data;
-    double* const residual = (double*)r_out.data;
-    double* const r = work.data;
-    double* const z = r + 4 * (size_t)rows;
-    double* const p = z + 4 * (size_t)rows;
-    double* const q = p + 4 * (size_t)rows;
-    double* const y = q + 4 * (size_t)rows;
-    double* const scalars = scalars_out.data;
-    const bool averaged = curvature.shape[0] > 0;
-    const double* const forward_ = (const double*)forward.data;
-
-    auto precondition = [&](int i) {{
-        // The rows of a symmetric matrix are its columns.
-        const double* const m = inverse + 9 * (size_t)i;
-        const D v = load(r + 4 * (size_t)i);
-        D found = load(m) * (D)v[0];
-        found += load(m + 3) * (D)v[1];
-        found += last_row(m) * (D)v[2];
-        found[3] = 0.0;
-        store(z + 4 * (size_t)i, found);
-        return dot(v, found);
-    }};
-
-    double rz = 0.0;
-    for (int i = 0; i < rows; ++i) {{
-        const size_t at = 4 * (size_t)i;
-        const D v = {{b[3 * (size_t)i], b[3 * (size_t)i + 1], b[3 * (size_t)i + 2], 0.0}};
-        store(r + at, v);
-        store(y + at, (D)0.0);
-        store(p + at, (D)0.0);
-        rz += precondition(i);
-    }}
-    scalars[{CG_RZ_START}] = rz;
-    const double target = rz * tolerance * tolerance;
-    double beta = 0.0;
-    int iteration = 0;
-    bool done = rz == 0.0, definite = rz >= 0.0;
-    while (!done && definite && iteration < max_iterations) {{
-        for (int i = 0; i < rows; ++i) {{
-            const size_t at = 4 * (size_t)i;
-            store(p + at, load(z + at) + beta * load(p + at));
-            store(q + at, (D)0.0);
-        }}
-        double pq = 0.0;
-        for (int i = 0; i < rows; ++i) {{
-            const size_t at = 4 * (size_t)i;
-            const D v = load(p + at);
-            const D v0 = (D)v[0], v1 = (D)v[1], v2 = (D)v[2];
-            int k = diagonal.data[i];
-            const double* m = entries + 9 * (size_t)k;
-            D s0 = load(m) * v, s1 = load(m + 3) * v, s2 = last_row(m) * v;
-            const int end = offsets.data[i + 1];
-            for (++k; k < end; ++k) {{
-                m += 9;
-                const D m0 = load(m), m1 = load(m + 3), m2 = last_row(m);
-                const size_t other = 4 * (size_t)columns.data[k];
-                const D w = load(p + other);
-                s0 += m0 * w;
-                s1 += m1 * w;
-                s2 += m2 * w;
-                D t = load(q + other);
-                t += m0 * v0;
-                t += m1 * v1;
-                t += m2 * v2;
-                store(q + other, t);
-            }}
-            const int extra_end = extra_offsets.data[i + 1];
-            for (k = extra_offsets.data[i]; k < extra_end; ++k) {{
-                const double* const n = extra + 9 * (size_t)k;
-                const D w = load(p + 4 * (size_t)extra_columns.data[k]);
-                s0 += load(n) * w;
-                s1 += load(n + 3) * w;
-                s2 += last_row(n) * w;
-            }}
-            // What lies left of the diagonal came with the rows before.
-            D t = load(q + at);
-            t[0] += (s0[0] + s0[1]) + s0[2];
-            t[1] += (s1[0] + s1[1]) + s1[2];
-            t[2] += (s2[0] + s2[1]) + s2[2];
-            t[3] = 0.0;
-            store(q + at, t);
-            pq += dot(v, t);
-        }}
-        if (averaged) {{
-            // q += G^T D G p, each row of G read once; spare numbers of q collect what is never used.
-            for (int i = 0; i < rows; ++i) {{
-                D total = (D)0.0;
-                const int begin = offsets.data[i], end = offsets.data[i + 1];
-                for (int k = begin; k < end; ++k)
-                    total += load(forward_ + 3 * (size_t)k) * load(p + 4 * (size_t)columns.data[k]);
-                const D change = (D)(curvature.data[i] * ((total[0] + total[1]) + total[2]));
-                for (int k = begin; k < end; ++k) {{
-                    double* const to = q + 4 * (size_t)columns.data[k];
-                    store(to, load(to) + change * load(forward_ + 3 * (size_t)k));
-                }}
-            }}
-            pq = 0.0;
-            for (int i = 0; i < rows; ++i)
-                pq += dot(load(p + 4 * (size_t)i), load(q + 4 * (size_t)i));
-        }}
-        definite = pq > 0.0;
-        if (!definite) break;
-        const double alpha = rz / pq;
-        const double previous = rz;
-        rz = 0.0;
-        for (int i = 0; i < rows; ++i) {{
-            const size_t at = 4 * (size_t)i;
-            store(y + at, load(y + at) + alpha * load(p + at));
-            store(r + at, load(r + at) - alpha * load(q + at));
-            rz += precondition(i);
-        }}
-        beta = rz / previous;
-        ++iteration;
-        definite = rz >= 0.0;
-        done = definite && rz <= target;
-    }}
-    for (int i = 0; i < rows; ++i)
-        for (int j = 0; j < 3; ++j) {{
-            x[3 * (size_t)i + j] = y[4 * (size_t)i + j];
-            residual[3 * (size_t)i + j] = r[4 * (size_t)i + j];
-        }}
-    scalars[{CG_RZ}] = rz;
-    scalars[{CG_ITERATIONS}] = iteration;
-    scalars[{CG_DONE}] = done ? 1.0 : definite ? 0.0 : -1.0;
-#endif
-"""
-
-
-@wp.func_native(_CG_SERIAL)
-def cg_solve(
-    rows: int,
-    max_iterations: int,
-    tolerance: wp.float64,
-    offsets: wp.array[wp.int32],
-    columns: wp.array[wp.int32],
-    diagonal: wp.array[wp.int32],
-    values: wp.array[wp.mat33d],
-    extra_offsets: wp.array[wp.int32],
-    extra_columns: wp.array[wp.int32],
-    extra_values: wp.array[wp.mat33d],
-    forward: wp.array[wp.vec3d],
-    curvature: wp.array[wp.float64],
-    inverse_diagonal: wp.array[wp.mat33d],
-    right_hand_side: wp.array[wp.vec3d],
-    work: wp.array[wp.float64],
-    r_out: wp.array[wp.vec3d],
-    x_out: wp.array[wp.vec3d],
-    scalars_out: wp.array[wp.float64],
-): ...
-
-
-@wp.kernel
-def cg_serial(
-    _start: int,
-    # In:
-    rows: int,
-    max_iterations: int,
-    tolerance: wp.float64,
-    offsets: wp.array[wp.int32],
-    columns: wp.array[wp.int32],
-    diagonal: wp.array[wp.int32],
-    values: wp.array[wp.mat33d],
-    extra_offsets: wp.array[wp.int32],
-    extra_columns: wp.array[wp.int32],
-    extra_values: wp.array[wp.mat33d],
-    forward: wp.array[wp.vec3d],
-    curvature: wp.array[wp.float64],
-    inverse_diagonal: wp.array[wp.mat33d],
-    right_hand_side: wp.array[wp.vec3d],
-    # Work:
-    work: wp.array[wp.float64],
-    # Out:
-    r_out: wp.array[wp.vec3d],
-    x_out: wp.array[wp.vec3d],
-    scalars_out: wp.array[wp.float64],
-):
-    """Preconditioned conjugate gradients (Saad, Iterative Methods, 2nd ed., algorithm 9.1), one CPU thread.
-
-    Stops when r.M^-1 r has fallen by tolerance^2. Launch with dim 1. `values` is symmetric as a whole, each
-    row's columns ascending; `diagonal` [rows] holds the places of its diagonal; `work` holds 20 rows.
-    """
-    cg_solve(
-        rows,
-        max_iterations,
-        tolerance,
-        offsets,
-        columns,
-        diagonal,
-        values,
-        extra_offsets,
-        extra_columns,
-        extra_values,
-        forward,
-        curvature,
-        inverse_diagonal,
-        right_hand_side,
-        work,
-        r_out,
-        x_out,
-        scalars_out,
-    )
 
 
 @wp.kernel

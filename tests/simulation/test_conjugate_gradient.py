@@ -8,6 +8,7 @@ from scipy.sparse import bsr_matrix
 from scipy.sparse.linalg import spsolve
 
 from gdpro_sim.simulation.fem.potential import IncrementalPotential
+from tests.reference.linear import gauss_seidel_cg
 from tests.simulation.fem_models import make_model, potential_at, tet_box
 
 both_forms = pytest.mark.parametrize("serial", [True, False])
@@ -53,6 +54,36 @@ def test_coupled_blocks_are_part_of_the_matrix(serial: bool) -> None:
             np.abs(rest - system.residual.numpy()).max()
             <= 1e-8 * np.abs(system.right_hand_side.numpy()).max()
         )
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.48])
+def test_sweeps_take_the_steps_of_the_textbook(poisson: float) -> None:
+    vertices, tets = tet_box((2, 3, 3), (0.4, 0.5, 0.5))
+    pinned = vertices[:, 2] < 1e-6
+    model = make_model(vertices, tets, young=1e5, poisson=poisson, pinned=pinned)
+    system = (potential := potential_at(model, vertices * [1.0, 1.0, 0.95], 1 / 120, vertices)).system
+    assert system.serial
+    potential.linearise(potential.trial)
+    system.couple(couplings(system.rows, 3))
+    count = system.rows
+    whole = np.stack([system.product(row.reshape(-1, 3)).ravel() for row in np.eye(3 * count)])
+    free = np.repeat(~pinned, 3)
+    within = whole[np.ix_(free, free)]
+    loads = system.right_hand_side.numpy().reshape(-1)[free]
+    # L is that of the fixed pattern: neither coupled blocks nor averaged pressure belong to it.
+    system.couple(None)
+    pattern = system.matrix().toarray()[np.ix_(free, free)]
+    blocks = np.arange(len(pattern)) // 3
+    upper = np.where(blocks[:, None] < blocks[None], pattern, 0.0)
+    diagonal = np.linalg.inv(system.inverse_diagonal.numpy()[~pinned])
+    system.couple(couplings(system.rows, 3))
+    assert len(system._change) == (count if poisson > 0.45 else 0)
+    for steps in (1, 2, 7):
+        expected = gauss_seidel_cg(within, diagonal, upper, loads, steps)
+        assert system.solve(1e-14, steps).iterations == steps
+        found = system.solution.numpy()
+        assert not found[pinned].any()
+        assert np.abs(found.reshape(-1)[free] - expected).max() <= 1e-9 * np.abs(expected).max()
 
 
 @both_forms
