@@ -15,10 +15,13 @@ from gdpro_sim import device as devices
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import particles as particle_rows
 from gdpro_sim.materials import Material
+from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.conditions import Force, Hold, Impulse, Motion, Wind
 from gdpro_sim.simulation.fem import SolverFEM
 from gdpro_sim.simulation.model import Ground, Model, MpmSettings, Particles
 from gdpro_sim.simulation.mpm import SolverMPM
+from gdpro_sim.simulation.mpm.boundaries import Obstacles
+from gdpro_sim.simulation.mpm.drivers import top_speed
 from tests.simulation.fem_models import make_model, tet_box
 from tests.simulation.mpm_blocks import BALL, GRAVITY, block, collider, run
 from tests.simulation.test_colliders import box_mesh
@@ -198,6 +201,65 @@ def test_a_wall_pushes_at_its_speed() -> None:
     assert solver.positions[:, 0].min() > wall_face
     # Pushed without loss it leaves at up to twice the wall's speed.
     assert 0.5 * 0.98 < solver.velocities[:, 0].mean() < 1.0
+
+
+def struck(shape: Collider, integrator: Any = "explicit") -> SolverMPM:
+    """A soft block, and what comes at ten times its speed of sound and more: some 17 cells in 0.02 s."""
+    settings = MpmSettings(integrator=integrator)
+    model = block(young=2e3, colliders=(shape,), gravity=(0.0,) * 3, mpm=settings)
+    solver = SolverMPM(model)
+    solver.step(0.02)
+    return solver
+
+
+FAST: dict[str, Any] = {"motion": [{"time": 0.02, "translation": (0.8, 0.0, 0.0)}], "friction": 0.0}
+
+
+@pytest.mark.parametrize("kind", ["box", "mesh", "implicit"])
+def test_what_comes_fast_does_not_pass_through_matter(kind: str) -> None:
+    wall = collider(kind="box", size=(0.3, 1.0, 1.0), position=(-0.45, 0.0, 0.0), **FAST)
+    if kind == "mesh":
+        body = box_mesh((0.3, 1.0, 1.0), position=np.array([-0.45, 0.0, 0.0]), friction=0.0)
+        wall = dataclasses.replace(body, motion=wall.motion)
+    solver = struck(wall, "implicit" if kind == "implicit" else "explicit")
+    assert solver.positions[:, 0].min() > -0.3 + 0.8
+    assert solver.velocities[:, 0].min() > 20.0
+
+
+def test_a_fast_rigid_body_does_not_pass_through_matter() -> None:
+    ball = collider(
+        kind="sphere", radius=0.15, mass=50.0, position=(-0.3, 0.1, 0.1), velocity=(40.0, 0.0, 0.0)
+    )
+    solver = struck(ball)
+    obstacles = next(b for b in solver.boundaries if isinstance(b, Obstacles))
+    away = np.linalg.norm(solver.positions - obstacles.bodies.positions[0], axis=1)
+    assert away.min() > 0.15
+    carried = 50.0 * 40.0 / (50.0 + 8.0)
+    assert solver.velocities[:, 0].mean() > 0.95 * carried
+
+
+def test_substeps_that_obstacles_ask_for_are_told_of() -> None:
+    wall = collider(kind="box", size=(0.3, 1.0, 1.0), position=(-0.45, 0.0, 0.0), **FAST)
+    solver = SolverMPM(block(young=2e3, colliders=(wall,), mpm=MpmSettings(max_substeps=10)))
+    with pytest.raises(
+        SolverError, match=r"at most 10.*: slow down what colliders and pins do, or make cells"
+    ):
+        solver.step(0.02)
+
+
+def test_speed_of_what_is_moved() -> None:
+    """Of a keyframed motion that begins within the step, and of a spinning one: the farthest point's."""
+    points = np.array([[0.3, 0.1, 0.0], [0.1, 0.5, 2.0]])
+    late = dataclasses.replace(
+        motion(),
+        times=np.array([0.0, 0.5, 1.0]),
+        translations=np.array([(0.0,) * 3] * 2 + [(3.0, 0.0, 4.0)]),
+        rotations=np.zeros((3, 3)),
+    )
+    assert top_speed(late, points, 0.4, 0.2) == pytest.approx(10.0, rel=1e-9)
+    assert top_speed(late, points, 0.0, 0.4) == 0.0
+    spinning = motion(turn=720.0)
+    assert top_speed(spinning, points, 0.0, 0.1) == pytest.approx(0.4 * 4.0 * np.pi, rel=1e-4)
 
 
 def test_a_belt_carries_what_lies_on_it() -> None:

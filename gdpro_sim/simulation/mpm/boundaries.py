@@ -2,9 +2,9 @@
 
 Nodes in an obstacle, and those right outside, cannot move matter into it: it sticks, slips, or leaves and
 rubs, see `gdpro_sim.kernels.mpm_boundary`. What is held back is the surface of the particles, half their
-spacing from their middles. Where they overlap all the same, matter is pushed out slowly. Two limits: an
-obstacle thinner than two cells may have too few nodes to keep matter out (the log says which), and one that
-comes nearer by more than `SEEN` cells in a substep overlaps matter before it pushes.
+spacing from their middles. Substeps are short enough for what comes nearer to be seen before it touches.
+Where obstacles overlap matter all the same, it is pushed out slowly. A limit: an obstacle thinner than two
+cells may have too few nodes to keep matter out (the log says which).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gdpro_sim.simulation.collider_shapes import ColliderShape, placed
 from gdpro_sim.simulation.colliders import ROOM, Collider
 from gdpro_sim.simulation.conditions import FOREVER, Guide
 from gdpro_sim.simulation.model import Model
-from gdpro_sim.simulation.mpm.drivers import Holds, Loads
+from gdpro_sim.simulation.mpm.drivers import Holds, Loads, corners, top_speed
 from gdpro_sim.simulation.mpm.grid import Grid
 from gdpro_sim.simulation.mpm.rigid import RigidBodies, recentred
 
@@ -41,8 +41,8 @@ PARTICLES_REACH = 3.0
 """From the middle of a block's particles to where the last may stray, in cells along each axis."""
 
 SEEN = {"explicit": 0.4, "implicit": 1.75}
-"""Gaps wider than that many cells are not looked at. An explicit substep closes no wider ones, and across the
-wider of the two matter and obstacle share no nodes."""
+"""Gaps wider than that many cells are not looked at, and substeps close no wider ones; across the wider of
+the two matter and obstacle share no nodes."""
 
 AROUND = 2.1
 """Cells around what is seen that nodes know the distance of, to tell it between them."""
@@ -56,6 +56,12 @@ COUPLINGS = 8
 
 class Boundary(Protocol):
     """Changes velocities of nodes, or of particles, in every substep."""
+
+    def plan(self, time: float, dt: float) -> None:
+        """A step from `time` to `time` + `dt` s begins."""
+
+    def speed(self) -> float:
+        """Of the fastest thing that it moves through matter in this step, m/s."""
 
     def begin(self, time: float, h: float) -> None:
         """A substep from `time` to `time` + `h` s begins."""
@@ -118,6 +124,25 @@ class Obstacles:
         self._measured = False
         self._warned = False
         self._pairs: list[tuple[int, int]] = []
+        around = model.particles.positions.astype(np.float64)
+        self._corners = [_corners_of(item, around) for item in self.items]
+        self._driven = 0.0
+
+    def plan(self, time: float, dt: float) -> None:
+        self._taken.zero_()
+        self._driven = 0.0
+        for c in self._moving:
+            item = self.items[c]
+            if item.motion is not None and item.start < time + dt and time < item.end:
+                self._driven = max(self._driven, top_speed(item.motion, self._corners[c], time, dt))
+
+    def speed(self) -> float:
+        fastest = self._driven
+        for c, k in self._body_of.items():
+            lever = float(np.linalg.norm(self._corners[c] - self.items[c].position, axis=1).max())
+            spin = float(np.linalg.norm(self.bodies.angular_velocities[k]))
+            fastest = max(fastest, float(np.linalg.norm(self.bodies.velocities[k])) + lever * spin)
+        return fastest
 
     def begin(self, time: float, h: float) -> None:
         for c in self._moving:
@@ -194,14 +219,10 @@ class Obstacles:
         found = {"bodies": self.bodies.state} if self._body_of else {}
         return found | {"impulses": self._taken} if self.guided else found
 
-    def forget(self) -> None:
-        """Count `impulses` from here on."""
-        self._taken.zero_()
-
     def impulses(self) -> np.ndarray:
         """[C, 6] N s and N m s about the world's origin that the model's colliders took from matter.
 
-        0 for those that are not guided.
+        In the last step; 0 for those that are not guided.
         """
         found = np.zeros((len(self.items), 6))
         found[self.guided] = self._taken.numpy()
@@ -484,6 +505,23 @@ def _reaching(collider: Collider) -> Collider:
     if collider.vertices is None:
         return collider
     return replace(collider, size=(1e3 * float(np.linalg.norm(np.ptp(collider.vertices, axis=0))), 0.0, 0.0))
+
+
+def _corners_of(collider: Collider, points: np.ndarray) -> np.ndarray:
+    """[8, 3] m, of a box around a collider at the start; of a plane, what lies around `points` [N, 3]."""
+    a, b, c = collider.size
+    far = float(np.linalg.norm(points - collider.position, axis=1).max())
+    half = {
+        "plane": (far, far, far),
+        "box": (a, b, c),
+        "sphere": (a, a, a),
+        "capsule": (a, a, a + b),
+        "cylinder": (a, a, b),
+    }
+    own = collider.vertices
+    box = corners(np.array([half[collider.kind]]) * [[-1.0], [1.0]] if own is None else own)
+    found: np.ndarray = collider.position + box @ collider.rotation.T
+    return found
 
 
 def _table(grid: Grid, name: str, rows: int, columns: int) -> wp.array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import warp as wp
 
@@ -9,9 +11,27 @@ from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import mpm_boundary as kernels
 from gdpro_sim.kernels import mpm_drivers
 from gdpro_sim.kernels.particles import POSITION
-from gdpro_sim.simulation.conditions import Force, Impulse, pose_at
+from gdpro_sim.simulation.conditions import Force, Guide, Impulse, Motion, pose_at
 from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mpm.grid import OFFSETS, Grid
+
+SAMPLE = 1.0e-3
+"""s between the times at which a motion is looked at for its speed."""
+
+MOST_SAMPLES = 100
+"""In a step."""
+
+
+def top_speed(motion: Motion | Guide, points: np.ndarray, time: float, dt: float) -> float:
+    """m/s, that a motion gives the fastest of some points from `time` to `time` + `dt` s.
+
+    points: [n, 3] m, at the start
+    """
+    # What is guided goes evenly through the step that it was told of.
+    count = 1 if isinstance(motion, Guide) else int(np.clip(math.ceil(dt / SAMPLE), 1, MOST_SAMPLES))
+    poses = [pose_at(motion, time + dt * k / count) for k in range(count + 1)]
+    places = np.stack([points @ turn.T + shift for turn, shift in poses])
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=2).max()) * count / dt
 
 
 class Places:
@@ -54,6 +74,21 @@ class Holds:
         self._anchor: wp.array = wp.array(start, dtype=wp.vec3d, device=device)
         self._places = Places()
         self._known = np.zeros(0)  # which holds held when the nodes' sums were made
+        self._corners = [corners(model.particles.positions[hold.particles]) for hold in self.holds]
+        self._speed = 0.0
+
+    def plan(self, time: float, dt: float) -> None:
+        self._speed = max(
+            (
+                top_speed(hold.motion, box, time, dt)
+                for hold, box in zip(self.holds, self._corners, strict=True)
+                if hold.motion is not None and hold.start < time + dt and time < hold.release
+            ),
+            default=0.0,
+        )
+
+    def speed(self) -> float:
+        return self._speed
 
     def begin(self, time: float, h: float) -> None:
         for row, hold in zip(self._host, self.holds, strict=True):
@@ -156,6 +191,12 @@ class Loads:
         self._places = Places()
         self._time = 0.0
 
+    def plan(self, time: float, dt: float) -> None:
+        """What is pushed moves by its own speed."""
+
+    def speed(self) -> float:
+        return 0.0
+
     def begin(self, time: float, h: float) -> None:
         self._time = time
 
@@ -187,4 +228,10 @@ class Loads:
         return 1.0
 
 
-__all__ = ["Holds", "Loads"]
+def corners(points: np.ndarray) -> np.ndarray:
+    """[8, 3] of the box around points."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    return np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+__all__ = ["Holds", "Loads", "corners", "top_speed"]

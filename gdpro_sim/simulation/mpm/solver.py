@@ -13,7 +13,7 @@ from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import mpm_energy, mpm_laws
 from gdpro_sim.kernels import particles as rows
 from gdpro_sim.simulation.model import Diagnostics, Model, Particles
-from gdpro_sim.simulation.mpm.boundaries import Obstacles, boundaries
+from gdpro_sim.simulation.mpm.boundaries import SEEN, Obstacles, boundaries
 from gdpro_sim.simulation.mpm.grid import Grid
 from gdpro_sim.simulation.mpm.implicit import GridNewton
 from gdpro_sim.simulation.mpm.matter import Matter
@@ -146,8 +146,8 @@ class SolverMPM:
     def _advance(self, dt: float) -> None:
         begin, done, settings = self._time, 0.0, self.model.mpm
         self._counters = _Counters()
-        if self._obstacles is not None:
-            self._obstacles.forget()
+        for boundary in self.boundaries:
+            boundary.plan(begin, dt)
         self.grid.sort()
         while done < dt:
             left = dt - done
@@ -155,10 +155,14 @@ class SolverMPM:
             count = max(1, math.ceil(left / longest - 1e-9))
             if self._counters.substeps + count > settings.max_substeps:
                 way = "soften the material, make cells larger, or use the implicit integrator"
+                if self._driven() > self.grid.fastest():
+                    way = "slow down what colliders and pins do, or make cells larger"
+                elif self._newton is not None:
+                    way = "make cells larger"
                 raise SolverError(
                     f"{settings.integrator} substeps of {left / count:.3g} s would be needed "
                     f"{self._counters.substeps + count:,} times in a step of {dt:.3g} s (at most "
-                    f"{settings.max_substeps:,}): {way if self._newton is None else 'make cells larger'}"
+                    f"{settings.max_substeps:,}): {way}"
                 )
             h = left / count
             taken = self._substep(h)
@@ -174,7 +178,19 @@ class SolverMPM:
                 f"particles are lost at t = {self._time:.6g} s: their speed is no number; use a smaller "
                 "`cfl`, or check velocities and material constants"
             )
-        return min(self.model.mpm.cfl * self.spacing / max(fastest, 1e-30), self._viscous_step)
+        own = self.model.mpm.cfl * self.spacing / max(fastest, 1e-30)
+        return min(own, self._viscous_step, self._longest_unseen(fastest))
+
+    def _longest_unseen(self, speed: float) -> float:
+        """Longest substep in which what boundaries move comes upon no matter of that speed unseen, s."""
+        driven = self._driven()
+        if driven == 0.0:
+            return math.inf
+        return SEEN[self.model.mpm.integrator] * self.spacing / (driven + speed)
+
+    def _driven(self) -> float:
+        """Speed of the fastest thing that boundaries move, m/s."""
+        return max((boundary.speed() for boundary in self.boundaries), default=0.0)
 
     def _longest_implicit(self, dt: float) -> float:
         """Longest implicit substep, s: in it nothing moves or falls by more than `cfl` cells."""
@@ -184,7 +200,8 @@ class SolverMPM:
             raise SolverError(f"particles are lost at t = {self._time:.6g} s: their speed is no number")
         way, settings = self.model.mpm.cfl * self.spacing, self.model.mpm
         root = math.sqrt(speed**2 + 4.0 * way * math.hypot(*self.model.gravity))
-        return min(2.0 * way / max(speed + root, 1e-30), dt / settings.substeps)
+        longest = 2.0 * way / max(speed + root, 1e-30)
+        return min(longest, dt / settings.substeps, self._longest_unseen(speed))
 
     def _substep(self, h: float) -> float:
         """Advance by a substep of `h` seconds, or less where an implicit one fails; its length."""
