@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,11 +45,28 @@ KEYS = {
     "additional_material_params", "boundary_conditions", "substep_dt", "frame_dt", "frame_num",
     "rotation_degree", "rotation_axis", "sim_area", "scale", "mpm_space_viewpoint_center",
     "mpm_space_vertical_upward_axis", "default_camera_index", "init_azimuthm", "init_elevation",
+    "init_radius", "move_camera", "delta_a", "delta_e", "delta_r", "particle_filling", "show_hint",
 }  # fmt: skip
-"""That the scene follows."""
+"""That the scene follows, or says why not. `show_hint` only prints where a camera of the cloud stands."""
 
-SILENT = {"show_hint", "particle_filling", "init_radius", "delta_a", "delta_e", "delta_r", "move_camera"}
-"""Left out without a word where they say nothing: cameras fit the scene, bodies are filled anyway."""
+CONDITION_KEYS = {
+    "cuboid": {"point", "size", "velocity", "start_time", "end_time", "reset"},
+    "surface_collider": {"point", "normal", "surface", "friction", "start_time", "end_time"},
+    "bounding_box": set(),
+    "particle_impulse": {"force", "num_dt", "point", "size", "start_time"},
+    "enforce_particle_translation": {"point", "size", "velocity", "start_time", "end_time"},
+    "enforce_particle_velocity_rotation": {
+        "point", "normal", "half_height_and_radius", "rotation_scale", "translation_scale", "start_time",
+        "end_time",
+    },
+    "release_particles_sequentially": {
+        "normal", "start_position", "end_position", "num_layers", "start_time", "end_time",
+    },
+}  # fmt: skip
+"""That PhysGaussian reads of each boundary condition."""
+
+PART_KEYS = {"point", "size", "E", "nu", "density"}
+"""The same of `additional_material_params`."""
 
 
 @dataclass(frozen=True)
@@ -117,22 +136,30 @@ class _Conversion:
     def __init__(self, data: dict[str, Any], source: str) -> None:
         self.data, self.source = data, source
         self.messages: list[str] = []
-        for key in sorted(set(data) - KEYS - SILENT):
-            self.say(f"`{key}` is not followed")
-        up = np.asarray(data.get("mpm_space_vertical_upward_axis", [0, 0, 1]), float)
+        self._name_unknown(set(data), KEYS, "")
+        up = self.three("mpm_space_vertical_upward_axis", [0, 0, 1])
         axis = int(np.abs(up).argmax())
         if np.count_nonzero(up) != 1:
             self.say(f"mpm_space_vertical_upward_axis {up.tolist()} is no axis: +Z is up")
             axis, up = 2, np.array([0.0, 0.0, 1.0])
         self.turn = np.asarray(TURNS[f"{'-' if up[axis] < 0 else ''}{'xyz'[axis]}"], float)
-        self.substep = float(data.get("substep_dt", 1e-4))
-        frame = float(data.get("frame_dt", 1e-2))
+        self.substep = self.number("substep_dt", 1e-4, above=0.0)
+        frame = self.number("frame_dt", 1e-2, above=0.0)
         self.fps = max(1, round(1.0 / frame))
         if abs(self.fps * frame - 1.0) > 1e-3:
             self.say(f"frame_dt {frame:g} s is taken as {self.fps} frames per second")
-        self.duration = float(data.get("frame_num", 100)) * frame
-        self.spacing = float(data.get("grid_lim", 2.0)) / int(data.get("n_grid", 50))
-        self.density = float(data.get("density", 200.0))
+        self.duration = self.number("frame_num", 100, above=0.0) * frame
+        self.extent = self.number("grid_lim", 2.0, above=0.0)
+        self.spacing = self.extent / self.number("n_grid", 50, above=0.0)
+        self.density = self.number("density", 200.0)
+        degrees, axes = data.get("rotation_degree", []), data.get("rotation_axis", [])
+        lists = isinstance(degrees, list) and isinstance(axes, list) and len(degrees) == len(axes)
+        if not lists or not all(axis in (0, 1, 2) for axis in axes):
+            raise self.wrong(f"rotation_degree {degrees} and rotation_axis {axes} do not fit together")
+        self.rotation = np.eye(3)
+        for degree, number in zip(degrees, axes, strict=True):
+            turned = Rotation.from_euler("xyz"[number], degree, degrees=True).as_matrix()
+            self.rotation = turned @ self.rotation
         self.cloud: np.ndarray | None = None  # means of the simulated cloud in PhysGaussian's space
 
     def say(self, text: str) -> None:
@@ -141,19 +168,40 @@ class _Conversion:
     def wrong(self, text: str) -> RequestError:
         return RequestError(f"{self.source}: {text}")
 
+    def number(self, name: str, default: float, *, above: float = -math.inf) -> float:
+        """A number of the configuration. Raises RequestError where it is none, or not above a bound."""
+        value = self.data.get(name)
+        value = default if value is None else value
+        if isinstance(value, bool) or not isinstance(value, int | float) or not above < value < math.inf:
+            bound = "" if above == -math.inf else f" > {above:g}"
+            raise self.wrong(f"{name} must be a finite number{bound}, got {value!r}")
+        return float(value)
+
+    def three(self, name: str, default: Any) -> np.ndarray:
+        """Three numbers of the configuration. Raises RequestError where they are not."""
+        value = self.data.get(name, default)
+        try:
+            found = np.asarray(value, float)
+        except (TypeError, ValueError):
+            found = np.zeros(0)
+        if found.shape != (3,) or not np.isfinite(found).all():
+            raise self.wrong(f"{name} must be three finite numbers, got {value!r}")
+        return found
+
+    def _name_unknown(self, given: set[str], known: set[str], where: str) -> None:
+        for key in sorted(given - known):
+            self.say(f"{where}`{key}` is not followed")
+
     # ---- the body ----
 
     def body(self, asset: Path, output: Path) -> dict[str, Any]:
         """The scene's only body, without pins; a cloud is written beside the scene as it is simulated."""
         if not asset.is_file():
             raise RequestError(f"{asset}: no such file")
-        rotation = np.eye(3)
-        degrees, axes = self.data.get("rotation_degree", []), self.data.get("rotation_axis", [])
-        if len(degrees) != len(axes) or not set(axes) <= {0, 1, 2}:
-            raise self.wrong(f"rotation_degree {degrees} and rotation_axis {axes} do not fit together")
-        for degree, axis in zip(degrees, axes, strict=True):
-            rotation = Rotation.from_euler("xyz"[axis], degree, degrees=True).as_matrix() @ rotation
-        size = float(self.data.get("scale", 1.0))
+        filled = "`particle_filling`: the body is filled in a way of its own, evenly"
+        without = "without `particle_filling` PhysGaussian moves a hollow shell; here the body is filled"
+        self.say(filled if self.data.get("particle_filling") is not None else without)
+        rotation, size = self.rotation, self.number("scale", 1.0, above=0.0)
         place: dict[str, Any] = {"name": "body", "position": self.point(MIDDLE)}
         if is_cloud(asset):
             file = output.with_name(f"{output.stem}_asset.usdc")
@@ -162,6 +210,8 @@ class _Conversion:
         points = self._vertices(asset)
         if self.data.get("sim_area") is not None:
             self.say("`sim_area` is for splat clouds: the whole asset is simulated")
+        if "opacity_threshold" in self.data:
+            self.say("`opacity_threshold` is for splat clouds: all of the asset is kept")
         turned = points @ rotation.T
         longest = float(np.ptp(turned, axis=0).max())
         angles = Rotation.from_matrix(self.turn @ rotation).as_euler("xyz", degrees=True)
@@ -181,10 +231,12 @@ class _Conversion:
     def _cloud(self, asset: Path, rotation: np.ndarray, size: float) -> Asset:
         """What is simulated of a cloud, turned, centred at the origin and scaled."""
         cloud = read_cloud(asset)
-        keep = cloud.opacities > float(self.data.get("opacity_threshold", 0.02))
+        keep = cloud.opacities > self.number("opacity_threshold", 0.02)
         turned = rotated(_chosen(cloud, keep), rotation)
         area = self.data.get("sim_area")
         if area is not None:
+            if np.shape(area) != (6,):
+                raise self.wrong(f"sim_area must be six numbers, got {area!r}")
             low, high = torch.tensor(area[0::2]), torch.tensor(area[1::2])
             inside = ((turned.means > low) & (turned.means < high)).all(1)
             self.say(f"`sim_area`: the {int((~inside).sum()):,} Gaussians outside it are left out")
@@ -225,24 +277,26 @@ class _Conversion:
         colliders: list[dict[str, Any]] = []
         solver: dict[str, Any] = {"kind": "mpm"}
         solver.update({"grid_spacing": self.spacing} if particles is None else {"particles": particles})
-        damping = float(self.data.get("rpic_damping", 0.0))
+        damping = self.number("rpic_damping", 0.0)
         if damping < -0.001:
             solver["transfer"] = "pic"
         elif damping > 0.0:
             self.say(f"`rpic_damping` {damping:g} is not followed: transfers are APIC")
-        for part in self.data.get("additional_material_params", []):
-            changed = {"young": part["E"], "poisson": part["nu"]}
-            changed["density"] = part.get("density", self.density)
-            region = self.box(part["point"], part["size"])
-            body.setdefault("parts", []).append({**region, "material": {**body["material"], **changed}})
-        for condition in self.data.get("boundary_conditions", []):
+        if "substep_dt" in self.data:
+            self.say("`substep_dt` tells how hard it damps and pushes; substeps follow the speed of sound")
+        for part in self._listed("additional_material_params"):
+            self._name_unknown(set(part), PART_KEYS, "additional_material_params: ")
+            with self._reading("additional_material_params"):
+                body.setdefault("parts", []).append(self._part(part, body["material"]))
+        for condition in self._listed("boundary_conditions"):
             self._condition(condition, body, colliders, solver)
         gravity = self.data.get("g", 9.8)
+        down = self.three("g", None) if isinstance(gravity, list) else [0.0, 0.0, -self.number("g", 9.8)]
         scene = {
             "description": f"PhysGaussian's configuration {Path(self.source).name}.",
             "bodies": [body],
             "ground": None,
-            "gravity": self.vector(gravity if isinstance(gravity, list) else [0.0, 0.0, -float(gravity)]),
+            "gravity": self.vector(down),
             "fps": self.fps,
             "duration": self.duration,
             "camera": self.camera(),
@@ -252,28 +306,68 @@ class _Conversion:
             scene["colliders"] = colliders
         return scene
 
+    def _listed(self, name: str) -> list[dict[str, Any]]:
+        found = self.data.get(name) or []
+        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+            raise self.wrong(f"{name} must be a list of mappings")
+        return found
+
+    @contextmanager
+    def _reading(self, what: str) -> Iterator[None]:
+        """Tells where something of a configuration that is missing or of another kind stands."""
+        try:
+            yield
+        except (KeyError, TypeError, IndexError, ValueError) as error:
+            raise self.wrong(f"{what} lacks or misstates {error}") from None
+
+    def _part(self, part: dict[str, Any], material: dict[str, Any]) -> dict[str, Any]:
+        """Matter of another stiffness and density."""
+        changed = {"young": part["E"], "poisson": part["nu"], "density": part.get("density", self.density)}
+        return {**self.box(part["point"], part["size"]), "material": {**material, **changed}}
+
     def camera(self) -> dict[str, Any]:
-        view: dict[str, Any] = {"target": self.point(self.data.get("mpm_space_viewpoint_center", MIDDLE))}
+        target = self.point(self.three("mpm_space_viewpoint_center", MIDDLE))
+        view: dict[str, Any] = {"target": target}
         if self.data.get("default_camera_index", 0) != -1:
             if "default_camera_index" in self.data:
                 self.say("`default_camera_index`: the cloud's own cameras are not read")
             return view
-        for key, name in (("azimuth", "init_azimuthm"), ("elevation", "init_elevation")):
-            if self.data.get(name) is not None:
-                view[key] = float(self.data[name])
-        view["elevation"] = min(max(view.get("elevation", 14.0), -89.0), 89.0)
+        names = ("init_azimuthm", "init_elevation", "init_radius", "delta_a", "delta_e", "delta_r")
+        azimuth, elevation, radius, *steps = (self.number(name, 0.0) for name in names)
+        around, up, away = steps if self.data.get("move_camera") else (0.0, 0.0, 0.0)
+        view["azimuth"] = self._azimuth(azimuth)
+        view["elevation"] = _upright(elevation)
+        if around:  # its angles grow clockwise, per frame
+            view["orbit"] = {"rate": -around * self.fps}
+        if up:
+            end = _upright(elevation + up * self.fps * self.duration)
+            view["motion"] = [{"time": self.duration, "elevation": end}]
+            view["interpolation"] = "linear"
+        if radius or away:
+            self.say("`init_radius`, `delta_r`: the camera stands where the body fits into the picture")
         return view
+
+    def _azimuth(self, angle: float) -> float:
+        """Degrees from +X in the scene. Theirs count from the part of (1, 1, 1) across the vertical, both in
+        the cloud's own frame, clockwise seen from above."""
+        vertical = (self.turn @ self.rotation).T @ [0.0, 0.0, 1.0]
+        first = np.ones(3)
+        if abs(first @ vertical) < 0.01:
+            first = np.array([0.72, 0.37, -0.67])
+        first -= (first @ vertical) * vertical
+        x, y, _ = self.turn @ self.rotation @ first
+        return math.degrees(math.atan2(y, x)) - angle
 
     def material(self) -> dict[str, Any]:
         data = self.data
         name = data.get("material", "jelly")
-        young, poisson = float(data.get("E", 1e5)), float(data.get("nu", 0.4))
+        young, poisson = self.number("E", 1e5), self.number("nu", 0.4)
         shear = young / (2.0 * (1.0 + poisson))
         made: dict[str, Any] = {"young": young, "poisson": poisson, "density": self.density}
-        scale = float(data.get("grid_v_damping_scale", 1.1))
+        scale = self.number("grid_v_damping_scale", 1.1)
         if 0.0 < scale < 1.0:  # velocities, each substep
             made["rayleigh_mass"] = -math.log(scale) / self.substep
-        stress = float(data.get("yield_stress", 0.0))
+        stress = self.number("yield_stress", 0.0)
         if name in ("metal", "plasticine", "foam") and not stress > 0.0:
             raise self.wrong(f"material {name!r} needs a yield_stress > 0")
         if name == "jelly":
@@ -282,7 +376,7 @@ class _Conversion:
             # Theirs is a Frobenius norm of the deviatoric stress, and grows by 2 mu xi of the strain's.
             made.update(model="stvk_hencky", yield_stress=math.sqrt(1.5) * stress)
             if data.get("hardening") == 1:
-                made["hardening"] = 3.0 * shear * float(data.get("xi", 0.0))
+                made["hardening"] = 3.0 * shear * self.number("xi", 0.0)
             if name == "plasticine":
                 self.say("material 'plasticine': its softening is not followed, it flows and does not break")
             return made
@@ -292,7 +386,7 @@ class _Conversion:
             self.say("material 'snow': PhysGaussian's has no stress; taken as that of Stomakhin et al. 2013")
             return {**made, "model": "snow"}
         if name == "foam":
-            viscosity = float(data.get("plastic_viscosity", 0.0))
+            viscosity = self.number("plastic_viscosity", 0.0)
             if not viscosity > 0.0:
                 return {**made, "model": "stvk_hencky", "yield_stress": stress}
             # Their overstress is viscosity times the norm of the strain rate: rate / sqrt(2) in shear.
@@ -318,10 +412,9 @@ class _Conversion:
         found = condition.get("type")
         if found not in kinds:
             raise self.wrong(f"boundary condition {found!r} is none of {', '.join(kinds)}")
-        try:
+        self._name_unknown(set(condition), CONDITION_KEYS[found] | {"type"}, f"{found}: ")
+        with self._reading(f"boundary condition {found!r}"):
             kinds[found]()
-        except (KeyError, TypeError, IndexError) as error:
-            raise self.wrong(f"boundary condition {found!r} lacks or misstates {error}") from None
 
     def _add(self, body: dict[str, Any], key: str, *items: dict[str, Any] | None) -> None:
         for item in items:
@@ -368,7 +461,7 @@ class _Conversion:
 
     def _walls(self) -> list[list[float]]:
         """Nodes 0 to 2 and the last 3 of each axis let nothing out."""
-        low, high = 2.0 * self.spacing, float(self.data.get("grid_lim", 2.0)) - 3.0 * self.spacing
+        low, high = 2.0 * self.spacing, self.extent - 3.0 * self.spacing
         corners = np.array([self.point(np.full(3, end)) for end in (low, high)])
         return [corners.min(axis=0).tolist(), corners.max(axis=0).tolist()]
 
@@ -424,14 +517,24 @@ class _Conversion:
         near, far = float(c["end_position"]), float(c["start_position"])
         step, end = abs(far - near) / LAYERS, float(c["end_time"])
         slabs: list[dict[str, Any]] = []
+        start = float(c["start_time"])
         for layer in range(LAYERS):
+            release = end / LAYERS * (layer + 1)
+            if release <= start:
+                continue
+            keys = {"start": start, "release": release} if start > 0.0 else {"release": release}
             for side in (-1.0, 1.0):
                 point, half = MIDDLE.copy(), np.ones(3)
                 point[axis] = near + side * step * (LAYERS - layer - 0.5)
                 half[axis] = 0.5 * step * (1.0 - 1e-5)
-                slabs.append({**self.box(point, half), "release": end / LAYERS * (layer + 1)})
+                slabs.append({**self.box(point, half), **keys})
         self.say(f"release_particles_sequentially: {LAYERS} layers, each let go as a whole")
         return slabs
+
+
+def _upright(elevation: float) -> float:
+    """Degrees that a camera may stand at."""
+    return min(max(elevation, -89.0), 89.0)
 
 
 def _chosen(cloud: Gaussians, mask: torch.Tensor) -> Gaussians:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import Asset
 from gdpro_sim.cli import main
@@ -20,6 +21,7 @@ from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.cloud import import_cloud, is_cloud
 from gdpro_sim.io.physgaussian import Converted, convert
 from gdpro_sim.io.ply import write_ply
+from gdpro_sim.io.splat import TURNS
 from gdpro_sim.simulation.compile import compile_scene, load_assets
 from gdpro_sim.simulation.scene import load_scene
 
@@ -114,6 +116,41 @@ def test_materials(folder: Path, config: dict[str, Any], expected: dict[str, Any
         assert found == (value if isinstance(value, str) else pytest.approx(value, rel=1e-3)), key
 
 
+@pytest.mark.parametrize(
+    ("up", "turned"), [([0, 0, 1], []), ([0, 1, 0], [135.0, 30.0]), ([0, -1, 0], [45.0, 6.5])]
+)
+def test_the_camera_stands_where_physgaussians_does(folder: Path, up: list[int], turned: list[float]) -> None:
+    """Theirs (utils/camera_view_utils.py) stands on a sphere around a point, in the cloud's own frame."""
+    axes = [0, 2][: len(turned)]
+    angles = {"init_azimuthm": -36.7, "init_elevation": 8.0, "init_radius": 2.0}
+    steps = {"move_camera": True, "delta_a": 0.4, "delta_e": 0.1, "delta_r": 0.0}
+    view = converted(
+        folder, rotation_degree=turned, rotation_axis=axes, mpm_space_vertical_upward_axis=up, frame_num=50,
+        frame_dt=0.02, default_camera_index=-1, **angles, **steps,
+    ).scene.camera  # fmt: skip
+    turn = np.eye(3)
+    for degree, axis in zip(turned, axes, strict=True):
+        turn = Rotation.from_euler("xyz"[axis], degree, degrees=True).as_matrix() @ turn
+    vertical = turn.T @ up
+    first = np.ones(3) - vertical.sum() * vertical
+    first /= np.linalg.norm(first)
+    second = np.cross(first, vertical)
+    for frame in (0, 50):
+        azimuth, elevation = np.radians([-36.7 + 0.4 * frame, 8.0 + 0.1 * frame])
+        across = np.cos(azimuth) * first + np.sin(azimuth) * second
+        theirs = turn @ (np.cos(elevation) * across + np.sin(elevation) * vertical)
+        to_scene = np.asarray(TURNS[{(0, 0, 1): "z", (0, 1, 0): "y", (0, -1, 0): "-y"}[tuple(up)]])
+        assert view.orbit is not None and view.orbit.rate is not None
+        a = np.radians(view.azimuth + view.orbit.rate * frame * 0.02)
+        heights = [view.elevation, view.motion[0].elevation or 0.0]
+        e = np.radians(heights[frame > 0])
+        ours = [np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)]
+        np.testing.assert_allclose(ours, to_scene @ theirs, atol=1e-6)
+    still = converted(folder, default_camera_index=-1, **angles, **{**steps, "move_camera": False})
+    assert still.scene.camera.orbit is None and not still.scene.camera.motion
+    assert any("`init_radius`" in line for line in still.messages)
+
+
 def test_boundary_conditions(folder: Path) -> None:
     rotation = {
         "type": "enforce_particle_velocity_rotation", "point": [1, 1, 1.4], "normal": [0, 0, 1],
@@ -157,6 +194,9 @@ def test_sequential_release_and_parts(folder: Path) -> None:
     times = {round(pin.minimum[0], 3): pin.release for pin in pins if pin.minimum is not None}
     assert times[0.5] == pytest.approx(1.5) and min(t for t in times.values() if t) == pytest.approx(0.03)
     assert all((pin.minimum or (0,))[0] > 0.45 for pin in pins), "slabs beside the matter are left out"
+    late = converted(folder, "cloud.ply", boundary_conditions=[{**release, "start_time": 0.75}]).scene
+    assert {pin.start for pin in late.bodies[0].pins} == {0.75}
+    assert min(pin.release or 0.0 for pin in late.bodies[0].pins) > 0.75
     material = made.scene.bodies[0].parts[0].material
     assert (material.young, material.poisson, material.density) == (1e6, 0.2, 700.0)
 
@@ -195,6 +235,14 @@ def test_impulses_follow_the_cloud(folder: Path) -> None:
         ({"nu": 0.5}, "poisson: must be less than 0.5"),
         ({"E": 0}, "young: must be greater than 0"),
         ({"rotation_degree": [1.0]}, "do not fit together"),
+        ({"rotation_degree": 1.0, "rotation_axis": 0}, "do not fit together"),
+        ({"n_grid": 0}, "n_grid must be a finite number > 0, got 0"),
+        ({"frame_dt": "fast"}, "frame_dt must be a finite number > 0, got 'fast'"),
+        ({"g": [0, 0]}, "g must be three finite numbers"),
+        ({"mpm_space_viewpoint_center": 1}, "mpm_space_viewpoint_center must be three finite numbers"),
+        ({"boundary_conditions": {"type": "bounding_box"}}, "boundary_conditions must be a list of mappings"),
+        ({"additional_material_params": [{**BOX, "nu": 0.3}]}, "_params lacks or misstates 'E'"),
+        ({"boundary_conditions": [{"type": "particle_impulse", "force": "up"}]}, "'particle_impulse' lacks"),
     ],
 )  # fmt: skip
 def test_wrong_configurations_are_refused(folder: Path, config: dict[str, Any], expected: str) -> None:
@@ -203,9 +251,11 @@ def test_wrong_configurations_are_refused(folder: Path, config: dict[str, Any], 
 
 
 def test_what_is_not_followed_is_named(folder: Path) -> None:
-    cut = {"type": "surface_collider", "point": [1, 1, 1], "normal": [0, 0, 1], "surface": "cut"}
-    made = converted(folder, magic=1, rpic_damping=0.5, sim_area=[0] * 6, frame_dt=0.015,
-                     boundary_conditions=[cut])  # fmt: skip
+    cut = {"type": "surface_collider", "point": [1, 1, 1], "normal": [0, 0, 1], "surface": "cut", "tilt": 2}
+    part = {**BOX, "nu": 0.2, "E": 1e6, "yield_stress": 1e3}
+    made = converted(folder, magic=1, rpic_damping=0.5, sim_area=[0] * 6, frame_dt=0.015, softening=0.2,
+                     opacity_threshold=0.1, particle_filling={"n_grid": 100}, substep_dt=1e-4,
+                     additional_material_params=[part], boundary_conditions=[cut])  # fmt: skip
     said = "\n".join(made.messages)
     for words in (
         "`magic` is not",
@@ -213,6 +263,12 @@ def test_what_is_not_followed_is_named(folder: Path) -> None:
         "`sim_area` is for",
         "67 frames per",
         "'cut' is not",
+        "surface_collider: `tilt` is not",
+        "additional_material_params: `yield_stress` is not",
+        "`softening` is not",
+        "`opacity_threshold` is for",
+        "`particle_filling`: the body is filled",
+        "substeps follow the speed of sound",
     ):
         assert words in said
     assert len(made.messages) == len(set(made.messages)) and all("\n" not in line for line in made.messages)
@@ -233,7 +289,8 @@ def test_command_line(
     assert (
         run_main(monkeypatch, "convert", "config.json", "--asset", "box.ply", "-o", "new.yaml", "--json") == 0
     )
-    assert json.loads(capsys.readouterr().out)["notes"][0] == "`magic` is not followed"
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert notes[0] == "`magic` is not followed" and "here the body is filled" in notes[1]
     assert load_scene(folder / "new.yaml").bodies[0].asset == "box.ply"
     for wrong, expected in (
         (("scene.yaml", "--asset", "box.ply", "-o", "x.yaml"), "cannot be read as JSON"),
