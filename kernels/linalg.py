@@ -75,6 +75,68 @@ def row_product(
     ...
 
 
+@wp.func_native("""
+    const double* const m_ = (const double*)values.data;
+    const double* const x_ = x.data;
+    double* const out = product_out.data + 24 * (size_t)row;
+#if defined(__CUDACC__)
+    for (int k = begin; k < end; ++k) {
+        const double* const m = m_ + 9 * (size_t)k;
+        const double* const v = x_ + 24 * (size_t)columns.data[k];
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 6; ++j)
+                out[8 * i + j] += m[3 * i] * v[j] + m[3 * i + 1] * v[8 + j] + m[3 * i + 2] * v[16 + j];
+    }
+#else
+    typedef double D __attribute__((ext_vector_type(8)));
+    D sums[3];
+    __builtin_memcpy(sums, out, sizeof(sums));
+    for (int k = begin; k < end; ++k) {
+        const double* const m = m_ + 9 * (size_t)k;
+        D v[3];
+        __builtin_memcpy(v, x_ + 24 * (size_t)columns.data[k], sizeof(v));
+        for (int i = 0; i < 3; ++i)
+            sums[i] += v[0] * (D)m[3 * i] + v[1] * (D)m[3 * i + 1] + v[2] * (D)m[3 * i + 2];
+    }
+    __builtin_memcpy(out, sums, sizeof(sums));
+#endif
+""")
+def add_row_product_six(
+    row: int,
+    begin: int,
+    end: int,
+    columns: wp.array[wp.int32],
+    values: wp.array[wp.mat33d],
+    x: wp.array[wp.float64],
+    product_out: wp.array[wp.float64],
+):
+    """Add the sum over k in [begin, end) of values[k] x[columns[k]] to row `row`; see `product_six`."""
+    ...
+
+
+@wp.kernel
+def product_six(
+    start: int,
+    # In:
+    offsets: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    values: wp.array[wp.mat33d],
+    extra_offsets: wp.array[wp.int32],
+    extra_columns: wp.array[wp.int32],
+    extra_values: wp.array[wp.mat33d],
+    x: wp.array[wp.float64],
+    # Out:
+    product_out: wp.array[wp.float64],
+):
+    """A times six vectors at once, of which each vertex has 3 rows of 6 numbers and 2 spare ones."""
+    i = start + wp.tid()
+    for k in range(24):
+        product_out[24 * i + k] = wp.float64(0.0)
+    add_row_product_six(i, offsets[i], offsets[i + 1], columns, values, x, product_out)
+    begin = extra_offsets[i]
+    add_row_product_six(i, begin, extra_offsets[i + 1], extra_columns, extra_values, x, product_out)
+
+
 @wp.func
 def block_range(count: int, blocks: int, block: int) -> wp.vec2i:
     """The `block`-th of `blocks` contiguous ranges that cover `range(count)`."""

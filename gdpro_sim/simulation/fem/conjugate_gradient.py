@@ -66,6 +66,9 @@ class ConjugateGradient:
         self.right_hand_side, self.solution, self.residual, self._z, self._p, self._q = (
             wp.zeros(self.rows, dtype=wp.vec3d, device=device) for _ in range(6)
         )
+        self._six, self._product_six = (
+            wp.zeros(24 * self.rows, dtype=wp.float64, device=device) for _ in range(2)
+        )
         self._dots = wp.zeros(self.blocks, dtype=wp.float64, device=device)
         self._sums = wp.zeros(ROW_BLOCKS, dtype=wp.float64, device=device)
         self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
@@ -120,6 +123,18 @@ class ConjugateGradient:
             back = self._transposed.numpy()[:-1] * change[columns, None]
             found += np.stack([np.bincount(rows, back[:, k], self.rows) for k in range(3)], 1)
         return found
+
+    def product_six(self, x: np.ndarray) -> np.ndarray:
+        """A without G^T D G times x [P, 3, 6], float64."""
+        shape = self.rows, 3, 8
+        padded = self._six.numpy().reshape(shape)
+        padded[..., :6] = x
+        if self.device != "cpu":  # on the CPU it is the array itself
+            self._six.assign(padded.reshape(-1))
+        inputs = [self.offsets, self.columns, self.values]
+        inputs += [self._extra_offsets, self._extra_columns, self._extra_values, self._six]
+        self._launch(linalg.product_six, self.rows, inputs, [self._product_six])
+        return self._product_six.numpy().reshape(shape)[..., :6]
 
     def solve(self, tolerance: float, max_iterations: int) -> SolveReport:
         """Solve until the preconditioned residual has fallen by `tolerance`, starting from zero."""

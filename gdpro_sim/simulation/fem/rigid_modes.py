@@ -50,7 +50,7 @@ class RigidModes:
         basis = np.zeros((len(x), 3, 6))
         for piece, (_, arms, radius) in zip(self._pieces, frames, strict=True):
             basis[piece] = rigid_basis(arms / radius)
-        product = (system.matrix() @ basis.reshape(-1, 6)).reshape(len(x), 3, 6)
+        product = system.product_six(basis)
         solution = system.solution.numpy()
         for piece in self._pieces:
             z = basis[piece].reshape(-1, 6)

@@ -52,6 +52,9 @@ they descend on one fixed energy."""
 NEGLIGIBLE = 0.01
 """A residual that inertia alone would undo within this share of the tolerance counts as solved."""
 
+LAST = 0.1
+"""Of that, what rigid motions may keep in an iteration that may be the last: it is what momentum lacks."""
+
 RELAXATIONS = 60
 """Pseudo-steps of a quasi-static step before it counts as not converged."""
 
@@ -350,6 +353,8 @@ class SolverFEM:
                 potential.linearise(potential.start)
                 report, (slope, largest_move) = self._solve()
             negligible = NEGLIGIBLE * max(tolerance, 0.1 * largest_move) / (h * h)
+            if largest_move <= tolerance:
+                negligible *= LAST
             if self._rigid.correct(potential.system, potential.start.numpy(), negligible):
                 slope, largest_move = potential.step_measures()
             self._counters.newton_iterations += 1
