@@ -78,6 +78,16 @@ class ColliderBase(Moving):
             raise ValueError(f"a {self.kind} has no end and cannot move freely; leave out `mass`")
         return self
 
+    def mpm_only(self) -> str | None:
+        """The first key given that MPM alone knows, or None."""
+        given = {
+            "boundary": self.boundary != "separate",
+            "start": self.start > 0.0,
+            "end": self.end is not None,
+            "mass": self.mass is not None,
+        }
+        return next((key for key, present in given.items() if present), None)
+
 
 class PlaneCollider(ColliderBase):
     """Everything below a plane is solid."""

@@ -156,15 +156,24 @@ def check_supported(scene: Scene) -> None:
     elif isinstance(scene.solver, AnimationOptions):
         animation_supports(scene)
     elif isinstance(scene.solver, FemOptions):
-        for body in scene.bodies:
-            made = () if body.material is None else (body.material,)
-            _check_elements(f"{scene.name}: body {body.name!r}", body, made)
-            for k, pin in enumerate(body.pins):
-                if pin.start > 0.0:
-                    raise SceneError(
-                        f"{scene.name}: bodies[{body.name}].pins[{k}].start: belongs to MPM (`solver: "
-                        "{kind: mpm}`)"
-                    )
+        _fem_supports(scene)
+
+
+def _fem_supports(scene: Scene) -> None:
+    """Raise SceneError for what only MPM can do."""
+    belongs = "belongs to MPM (`solver: {kind: mpm}`)"
+    for body in scene.bodies:
+        made = () if body.material is None else (body.material,)
+        _check_elements(f"{scene.name}: body {body.name!r}", body, made)
+        for k, pin in enumerate(body.pins):
+            if pin.start > 0.0:
+                raise SceneError(f"{scene.name}: bodies[{body.name}].pins[{k}].start: {belongs}")
+    if scene.ground is not None and scene.ground.boundary != "separate":
+        raise SceneError(f"{scene.name}: ground.boundary: {scene.ground.boundary!r} {belongs}")
+    for k, collider in enumerate(scene.colliders):
+        key = collider.mpm_only()
+        if key is not None:
+            raise SceneError(f"{scene.name}: colliders[{k}].{key}: {belongs}")
 
 
 def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu") -> Model:

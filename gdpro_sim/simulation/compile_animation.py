@@ -202,6 +202,11 @@ def check_supported(scene: Scene) -> None:
         "wind": bool(scene.wind),
         "springs": bool(scene.springs),
         "attachments": bool(scene.attachments),
+        "ground.boundary": scene.ground is not None and scene.ground.boundary != "separate",
+        **{
+            f"colliders[{k}].{collider.mpm_only()}": collider.mpm_only() is not None
+            for k, collider in enumerate(scene.colliders)
+        },
         **{
             f"bodies[{body.name}].{key}": bool(getattr(body, key)) and getattr(body, key) != none
             for body in scene.bodies

@@ -137,8 +137,11 @@ def _sub_scenes(
     """A scene with one solver for each part that has bodies, and for MuJoCo, whose base may have all."""
     for part in PARTS:
         bodies = tuple(body for body in scene.bodies if named.get(body.name) == part)
+        ground = scene.ground
         if part == "mujoco":
             bodies = tuple(as_part(scene, body) for body in bodies)
+            if ground is not None and "mpm" in named.values():  # to rigid bodies it is as hard as any
+                ground = ground.model_copy(update={"boundary": "separate"})
         elif not bodies:
             continue
         given = getattr(options, part)
@@ -151,25 +154,29 @@ def _sub_scenes(
             given = given.model_copy(update=update)
         yield (
             part,
-            scene.model_copy(update={"bodies": bodies, "solver": given, **_forces(scene, named, part)}),
+            scene.model_copy(
+                update={"bodies": bodies, "solver": given, "ground": ground, **_forces(scene, named, part)}
+            ),
         )
 
 
 def _forces(scene: Scene, named: dict[str, str], part: str) -> dict[str, Any]:
     """Springs, attachments and wind on bodies of a part."""
+    copies = members(scene.bodies)
 
-    def ours(names: Iterable[str | None]) -> bool:
-        return any(name is not None and named.get(name) == part for name in names)
+    def ours(names: Iterable[str | None]) -> list[str]:
+        """Bodies of the part that have one of the names, their own or that of all copies."""
+        meant = [body for name in names if name is not None for body in copies[name]]
+        return [body for body in dict.fromkeys(meant) if named.get(body) == part]
 
     winds = [
-        air if air.bodies is None
-        else air.model_copy(update={"bodies": tuple(name for name in air.bodies if named.get(name) == part)})
+        air.model_copy(update={"bodies": tuple(ours(named if air.bodies is None else air.bodies))})
         for air in scene.wind
-    ]  # fmt: skip
+    ]
     return {
         "springs": tuple(item for item in scene.springs if ours(end.body for end in item.ends)),
         "attachments": tuple(item for item in scene.attachments if ours(item.bodies)),
-        "wind": tuple(air for air in winds if air.bodies is None or air.bodies),
+        "wind": tuple(air for air in winds if air.bodies),
     }
 
 
@@ -177,7 +184,10 @@ def _forces(scene: Scene, named: dict[str, str], part: str) -> dict[str, Any]:
 
 
 def rigid_links(model: Model) -> tuple[tuple[Link, ...], tuple[Collider, ...]]:
-    """Rigid bodies of MuJoCo's model that move, and the solids of those that stand. Raises SceneError."""
+    """Rigid bodies of MuJoCo's model that are pushed, and the solids of those that stand or are taken along.
+
+    Raises SceneError.
+    """
     assert model.mujoco is not None
     links: list[Link] = []
     still: list[Collider] = []
@@ -190,7 +200,7 @@ def rigid_links(model: Model) -> tuple[tuple[Link, ...], tuple[Collider, ...]]:
             if report.watertight and report.volume > 0.0:  # better than its convex pieces
                 solids = (_meshed(body, body.surface, faces, np.zeros(3)),)
         if body.joint.kind == "fixed":
-            still += solids
+            still += (replace(solid, motion=body.motion) for solid in solids)
         else:
             links.append(Link(k, of_base=False, colliders=solids))
     return tuple(links), tuple(still)
@@ -245,8 +255,9 @@ def _check_supported(scene: Scene, named: dict[str, str]) -> None:
                 "alone; give both the same `solver`"
             )
     for k, air in enumerate(scene.wind):
-        unmoved = [name for name, part in named.items() if part == "mpm"]
-        if air.bodies is None and unmoved:
+        blown = named if air.bodies is None else [body for name in air.bodies for body in copies[name]]
+        unmoved = [name for name in blown if named.get(name) == "mpm"]
+        if unmoved:
             raise SceneError(
                 f"{scene.name}: wind[{k}].bodies: name the bodies it blows on; MPM's know no wind: "
                 f"{', '.join(unmoved)}"

@@ -76,7 +76,7 @@ class Placed:
     where:  how messages name it
     first:  number of its first point in the model
     points: [n, 3] float64 m
-    kind:   "vertex" or "particle"
+    kind:   "vertex", "particle", or "point" of a rigid body's surface
     placement: of its asset; None: its regions are where it stands, and none is painted
     """
 
@@ -101,8 +101,8 @@ class Placed:
         """Points in a region, counted from the body's first. Raises SceneError where there are none."""
         if region.vertices is not None and self.kind != "vertex":
             raise SceneError(
-                f"{self.where}.{key}.vertices: counts vertices of tets, which a body of particles has not; "
-                "give a box, a sphere or a side"
+                f"{self.where}.{key}.vertices: counts vertices of tets, which a body of {self.kind}s has "
+                "not; give a box, a sphere or a side"
             )
         if region.painted is not None or region.group is not None:
             return self._painted(region, key)

@@ -111,7 +111,7 @@ def compile_mujoco(
         material = material_of(body, placement.asset)
         form = form_of(body, assets[body.name])
         if form == "rigid":
-            made.append(_rigid(where, body, placement, material))
+            made.append(_rigid(scene, where, body, placement, material))
         else:
             made.append(_soft(scene, where, body, placement, material, form))  # type: ignore[arg-type]
         bodies.append(
@@ -189,14 +189,13 @@ def _numbered(model: Model, assets: dict[str, Asset]) -> Model:
 # ---- rigid ----
 
 
-def _rigid(where: str, body: SceneBody, placement: Placement, material: Material) -> RigidBody:
-    if body.pins:
-        raise SceneError(f"{where}: pins hold soft bodies; give a rigid one `mujoco: {{joint: fixed}}`")
+def _rigid(scene: Scene, where: str, body: SceneBody, placement: Placement, material: Material) -> RigidBody:
     own = body.mujoco or MujocoBody()
+    motion = _taken(scene, body, own, placement)
     solid = _weighed(where, placement)
     mass = solid.volume * material.density
     joint = Joint(
-        own.joint,
+        "fixed" if body.pins else own.joint,
         anchor=own.anchor if own.anchor is not None else _three(solid.centre),
         axis=own.axis or Joint().axis,
         damping=own.joint_damping,
@@ -217,7 +216,22 @@ def _rigid(where: str, body: SceneBody, placement: Placement, material: Material
         restitution=restitution,
         velocity=body.velocity,
         angular_velocity=body.angular_velocity,
+        motion=motion,
     )
+
+
+def _taken(scene: Scene, body: SceneBody, own: MujocoBody, placement: Placement) -> Motion | None:
+    """Where its pins take a rigid body: they hold all of it."""
+    if not body.pins:
+        return None
+    where = f"{scene.name}: bodies[{body.name}].pins"
+    if own.joint != "free":
+        raise SceneError(f"{where}: hold all of a rigid body; leave out `mujoco.joint`, or the pins")
+    if len(body.pins) > 1:
+        raise SceneError(f"{where}: one holds all of a rigid body; leave out the others")
+    item = Placed(scene, body.name, placement.surface, 0, "point", placement)
+    (ids,) = chosen_pins(body, item)
+    return item.motion(body.pins[0], ids, ids) if body.pins[0].motion else None
 
 
 def _weighed(where: str, placement: Placement) -> MassProperties:
@@ -299,6 +313,11 @@ def _soft(
     mass = asset.tets.volumes() * asset.tets.fill * material.density
     masses = np.bincount(asset.tets.tets.ravel(), weights=np.repeat(mass / 4.0, 4), minlength=len(vertices))
     pinned, motions = _pins(scene, body, vertices, placement)
+    if form == "full" and pinned.all():
+        raise SceneError(
+            f"{where}: its pins hold every vertex of a full flex, which MuJoCo cannot have; let it be rigid "
+            "(`mujoco: {form: rigid}`), or pin less"
+        )
     size = np.ptp(vertices, axis=0)
     cells = own.cells or tuple(int(n) for n in np.clip(np.round(CELLS * size / size.max()), 1, CELLS))
     return SoftBody(
@@ -361,6 +380,8 @@ def check_supported(scene: Scene) -> None:
                     f"{scene.name}: bodies[{body.name}].pins[{k}]: MuJoCo holds its vertices all the time; "
                     "leave out `start` and `release`, or choose the FEM solver"
                 )
+    if scene.ground is not None and scene.ground.boundary != "separate":
+        raise SceneError(f"{scene.name}: ground.boundary: {scene.ground.boundary!r} is MPM's; leave it out")
     for k, collider in enumerate(scene.colliders):
         where = f"{scene.name}: colliders[{k}]"
         if isinstance(collider, PlaneCollider) and collider.motion:

@@ -59,6 +59,7 @@ class RigidBody:
     """mass in kg; centre [3] m, of mass; inertia [3, 3] kg m^2 about it, world axes; surface [V, 3] m.
 
     restitution: speed after over speed before an impact, of what is as bouncy or more
+    motion:      takes it along, whatever it meets; its joint is "fixed" then
     """
 
     name: str
@@ -72,6 +73,7 @@ class RigidBody:
     restitution: float = 0.0
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     angular_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    motion: Motion | None = None
 
     @property
     def points(self) -> np.ndarray:

@@ -76,7 +76,9 @@ class SceneBody(Options):
     parts: tuple[Part, ...] = Field(
         default=(), description="parts of another material, MPM; the last that holds a particle counts"
     )
-    pins: tuple[Pin, ...] = Field(default=(), description="parts held in place, or moved along keyframes")
+    pins: tuple[Pin, ...] = Field(
+        default=(), description="parts held in place, or moved along keyframes; one holds all of a rigid body"
+    )
     forces: tuple[ConstantForce, ...] = Field(default=(), description="constant forces on parts of it")
     impulses: tuple[Push, ...] = Field(default=(), description="pushes at a time")
     pressures: tuple[SurfacePressure, ...] = Field(default=(), description="on parts of its surface")

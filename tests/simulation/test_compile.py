@@ -75,6 +75,12 @@ def test_placement(ball: Asset) -> None:
         ({"body": {"material": "sand"}}, "flows, which FEM cannot simulate"),
         ({"body": {"particles": 9}}, "`particles` belongs to MPM"),
         ({"body": {"pins": {"side": "top", "start": 1}}}, r"pins\[0\].start: belongs to MPM"),
+        ({"ground": {"boundary": "slip"}}, "ground.boundary: 'slip' belongs to MPM"),
+        ({"colliders": {"kind": "sphere", "radius": 1, "mass": 1}}, r"colliders\[0\].mass: belongs to MPM"),
+        (
+            {"colliders": {"kind": "sphere", "radius": 1, "end": 1}, "solver": {"kind": "animation"}},
+            r"colliders\[0\].end: has no effect without physics",
+        ),
         (
             {"solver": {"kind": "mujoco"}, "body": {"pins": {"side": "top", "release": 1}}},
             "leave out `start`",

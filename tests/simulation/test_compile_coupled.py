@@ -135,6 +135,12 @@ def test_frames_of_a_ball_that_a_jelly_holds_up(ball: Asset) -> None:
         ),
         ([{**RIGID, "pins": {"box": [[-1, -1, 0], [1, 1, 1]]}}], {}, "pins"),
         ([{"material": "sand", "solver": "fem"}], {}, "flows, which FEM cannot simulate"),
+        ([{}], {"ground": {"boundary": "sticky"}}, "ground.boundary: 'sticky' belongs to MPM"),
+        ([RIGID], {"ground": {"boundary": "sticky"}}, "ground.boundary: 'sticky' is MPM's"),
+        (
+            [{"solver": "mpm", "copies": {"count": 2, "spacing": 1}}], {"wind": {"bodies": ["b0"]}},
+            r"wind\[0\].bodies: .* MPM's know no wind: b0_0, b0_1",
+        ),
     ],
 )  # fmt: skip
 def test_refused_before_a_run(
@@ -144,6 +150,28 @@ def test_refused_before_a_run(
         check_supported(scene_of(*bodies, **scene))
         compiled(ball, *bodies, **scene)
     assert "\n" not in str(error.value)
+
+
+def test_forces_find_the_bodies_of_their_part(ball: Asset) -> None:
+    copies = {"count": 2, "spacing": 0.3, "poses": None}
+    spring = {"ends": [{"body": "b0", "point": [0, 0, 0.1]}, {"point": [0, 0, 1]}], "stiffness": 10}
+    bodies: list[dict[str, Any]] = [{"copies": copies}, {**RIGID, "position": [0, 0, 1]}]
+    model = compiled(ball, *bodies, springs=spring, wind=[{}, {"bodies": ["b0"]}, {"bodies": ["b1"]}])
+    assert model.coupling is not None
+    fem, rigid = (model.coupling.parts[part] for part in ("fem", "mujoco"))
+    assert fem.springs is not None and len(fem.springs.stiffness) == 2 and rigid.springs is None
+    assert len(fem.loads) == 2 and len(rigid.loads) == 2
+    assert len(compiled(ball, {}, wind={}).coupling.parts["mujoco"].loads) == 0  # type: ignore[union-attr]
+
+
+def test_the_ground_may_hold_particles_alone(ball: Asset) -> None:
+    model = compiled(
+        ball, {"solver": "mpm", "position": [0.5, 0, 0]}, RIGID, ground={"boundary": "sticky"},
+        solver={"kind": "coupled", "mpm": {"particles": 400}},
+    )  # fmt: skip
+    assert model.coupling is not None
+    boundaries = {part: item.ground.boundary for part, item in model.coupling.parts.items() if item.ground}
+    assert boundaries == {"mpm": "sticky", "mujoco": "separate"}
 
 
 def test_a_missing_base_is_named(tmp_path: Path) -> None:

@@ -164,7 +164,6 @@ def test_pieces_are_kept_in_the_file(ball: Asset, tmp_path: Path) -> None:
             {}, "cannot gain a velocity alone",
         ),
         ({"material": "steel", "mujoco": {"shape": "box"}, "pressures": {"pressure": 5}}, {}, "does nothing"),
-        ({"material": "steel", "pins": {"side": "top"}, "mujoco": {"shape": "box"}}, {}, "joint: fixed"),
         ({"material": "water"}, {}, "flows or tears"),
         ({"material": "jelly", "pins": {"side": "top", "release": 1}}, {}, "leave out `start` and `release`"),
         ({}, {"solver": {"kind": "mujoco", "controls": {"a": []}}}, "at least one keyframe"),

@@ -37,8 +37,19 @@ def quaternion(rotation: np.ndarray) -> list[float]:
     return [w, x, y, z]
 
 
-def add_rigid(spec: mujoco.MjSpec, body: RigidBody, name: str, timestep: float) -> tuple[Any, list[Any]]:
-    """The body, its frame at its centre of mass along the world's axes at the start, and its geoms."""
+def add_rigid(
+    spec: mujoco.MjSpec, body: RigidBody, name: str, timestep: float, weight: float
+) -> tuple[Any, list[Any]]:
+    """The body, its frame at its centre of mass along the world's axes at the start, and its geoms.
+
+    weight: kg that it meets, should it be driven
+    """
+    solref = reference(body.restitution, timestep)
+    if body.motion is not None:
+        size = float(np.linalg.norm(np.ptp(body.surface, axis=0)))
+        added = add_driven(spec, name, weight, max(size, 0.1))
+        added.pos = body.centre.tolist()
+        return added, add_shapes(spec, added, body.shapes, name, body.friction, solref)
     added = spec.worldbody.add_body(name=name, pos=body.centre.tolist())
     set_mass(added, body.mass, body.inertia)
     joint = body.joint
@@ -58,7 +69,6 @@ def add_rigid(spec: mujoco.MjSpec, body: RigidBody, name: str, timestep: float) 
             else:
                 item.limited = mujoco.mjtLimited.mjLIMITED_FALSE
         item.armature, item.frictionloss = 0.0, 0.0
-    solref = reference(body.restitution, timestep)
     return added, add_shapes(spec, added, body.shapes, name, body.friction, solref)
 
 

@@ -93,7 +93,7 @@ class SolverMuJoCo:
         self.bodies = model.mujoco.bodies
         self.renamed = self.world.renamed
         for ours, name in self.renamed:
-            log.warning("the name %r is the base's; the body is called %r there", ours, name)
+            log.warning("the name %r is taken; what has it here is called %r in MuJoCo", ours, name)
         self.mjmodel = compile_spec(self.world.spec, str(model.mujoco.base or "the scene"))
         self.mjdata = mujoco.MjData(self.mjmodel)
         self._view = mujoco.MjData(self.mjmodel)
@@ -360,7 +360,7 @@ class SolverMuJoCo:
                 self.mjdata.ctrl[actuator] = value
 
     def _driven_bodies(self) -> Iterator[tuple[str, Motion | Guide, np.ndarray, np.ndarray]]:
-        """(name, motion, rotation [3, 3] and position [3] m at the start) of moved obstacles and pins."""
+        """(name, motion, rotation [3, 3] and position [3] m at first) of obstacles, bodies and pins moved."""
         for name, collider in zip(self.world.obstacles, self.model.colliders, strict=True):
             if collider.motion is not None:
                 yield name, collider.motion, collider.rotation, collider.position
@@ -368,6 +368,8 @@ class SolverMuJoCo:
             if isinstance(body, SoftBody):
                 for k, motion in enumerate(body.motions):
                     yield soft.pin_name(name, k), motion, np.eye(3), np.zeros(3)
+            elif body.motion is not None:
+                yield name, body.motion, np.eye(3), body.centre
 
     def _motion(self, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Centres [b, 3], their velocities [b, 3], spins [b, 3] and inertias [b, 3, 3], world axes."""

@@ -87,9 +87,10 @@ def build(model: Model) -> World:
     ] = []  # friction, geoms, solref of each rigid body
     names = [name(body.name) for body in world.bodies]
     points: list[soft.Points | None] = []
+    weight = max(_weight(world), 1.0)
     for body, title in zip(world.bodies, names, strict=True):
         if isinstance(body, RigidBody):
-            _, shapes = rigid.add_rigid(spec, body, title, step)
+            _, shapes = rigid.add_rigid(spec, body, title, step, weight)
             geoms.append((body.friction, shapes, reference(body.restitution, step)))
             points.append(None)
         else:
@@ -105,10 +106,7 @@ def build(model: Model) -> World:
         floor.pos, floor.size = [0.0, 0.0, model.ground.height], [0.0, 0.0, 1.0]
         _passive(floor, 0.0)
         ours.append(floor.name)
-    made = [
-        _obstacle(spec, collider, name(collider.name), max(_weight(world), 1.0), geoms)
-        for collider in model.colliders
-    ]
+    made = [_obstacle(spec, collider, name(collider.name), weight, geoms) for collider in model.colliders]
     return World(
         spec,
         tuple(names),
@@ -191,9 +189,9 @@ def _rigid(world: MujocoWorld, number: int) -> RigidBody:
 def _weigh(
     spec: mujoco.MjSpec, world: MujocoWorld, names: list[str], points: list[soft.Points | None]
 ) -> None:
-    """Give rigid bodies the mass of what is tied to them."""
+    """Give rigid bodies the mass of what is tied to them; those that are driven are heavy enough."""
     tied = {tie.body for body in world.bodies if isinstance(body, SoftBody) for tie in body.ties}
-    for number in sorted(tied):
+    for number in sorted(number for number in tied if _rigid(world, number).motion is None):
         carried = [item for item in points if item is not None]
         chosen = [np.array([owner == names[number] for owner in item.owners]) for item in carried]
         where = np.concatenate([item.positions[own] for item, own in zip(carried, chosen, strict=True)])
