@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import import_mesh
-from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.gaussians import Gaussians, rotation_matrices
 from gdpro_sim.io.images import read_png
-from gdpro_sim.io.obstacles import Obstacles, with_obstacles
+from gdpro_sim.io.obstacles import BASE, Obstacles, with_obstacles
 from gdpro_sim.io.record import record
 from gdpro_sim.io.views import render_file
 from gdpro_sim.simulation.colliders import Collider, compile_collider
@@ -93,3 +95,30 @@ def test_a_recorded_run_shows_its_obstacles_again(tmp_path: Path) -> None:
             assert np.abs(first - read_png(path)).max() <= 2, index
         pictures.append(first)
     assert np.abs(pictures[1] - pictures[0]).max() > 50
+
+
+def covariances(gaussians: Gaussians) -> torch.Tensor:
+    axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None]
+    return axes @ axes.transpose(1, 2)
+
+
+def test_what_moves_is_drawn_turned_and_shifted() -> None:
+    key = {"time": 1, "translation": [0.5, -1, 2], "rotation": [30, 0, 90]}
+    shown = Obstacles([collider(kind="box", size=[0.2, 0.3, 0.4], motion=[key])], LOW, HIGH)
+    none = Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
+    before, outward = shown.added_to(none, torch.zeros(0, 3), 0.0)
+    after, facing = shown.added_to(none, torch.zeros(0, 3), 1.0)
+    turn = torch.tensor(Rotation.from_rotvec([30, 0, 90], degrees=True).as_matrix()).float()
+    close = functools.partial(torch.testing.assert_close, rtol=0.0, atol=1e-5)
+    close(after.means, before.means @ turn.T + torch.tensor([0.5, -1.0, 2.0]))
+    close(facing, outward @ turn.T)
+    close(covariances(after), turn @ covariances(before) @ turn.T, atol=1e-9)
+
+
+def test_parts_of_a_base_share_their_gaussians() -> None:
+    small, large = (
+        Collider("part", "box", size=(half, half, half), color=(0.5, 0.5, 0.5)) for half in (0.02, 0.1)
+    )
+    counts = [count for _, count in Obstacles([small, large] * 20, LOW, HIGH).counts]
+    assert counts[0] < counts[1]
+    assert 0.7 * BASE < sum(counts) < 1.3 * BASE
