@@ -321,7 +321,7 @@ def export(
 
 @app.command()
 def info(
-    file: Annotated[Path, typer.Argument(help="Asset, simulation or mesh file.")],
+    file: Annotated[Path, typer.Argument(help="Asset, simulation, mesh or splat cloud.")],
     json_output: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,

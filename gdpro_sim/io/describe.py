@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from gdpro_sim.asset import Asset, kind
+from gdpro_sim.io.cloud import is_cloud, read_cloud
 from gdpro_sim.io.usd import SimulationReader
 
 
 def describe(file: str | Path) -> dict[str, Any]:
-    """Facts about an asset, a simulation or a mesh file. Raises AssetError or MeshError for any other."""
+    """Facts about an asset, a simulation, a mesh or a splat cloud. Raises AssetError or MeshError."""
     path = Path(file)
     what = kind(path)
     if what == "asset":
@@ -29,6 +30,15 @@ def describe(file: str | Path) -> dict[str, Any]:
                 for body in reader.bodies
             },
             "precision": reader.precision,
+            "bytes": path.stat().st_size,
+        }
+    if path.is_file() and is_cloud(path):
+        cloud = read_cloud(path)
+        return {
+            "kind": "splat cloud",
+            "gaussians": len(cloud),
+            "sh_degree": cloud.sh_degree,
+            "size_m": np.ptp(cloud.means.numpy(), axis=0).round(6).tolist(),
             "bytes": path.stat().st_size,
         }
     from gdpro_sim.meshing.load import load_mesh

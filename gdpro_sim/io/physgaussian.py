@@ -28,7 +28,11 @@ from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.cloud import cloud_asset, is_cloud, read_cloud
 from gdpro_sim.io.splat import TURNS, rotated
 from gdpro_sim.meshing.load import load_mesh
+from gdpro_sim.simulation.compile import load_assets
+from gdpro_sim.simulation.compile_mpm import starting_points
+from gdpro_sim.simulation.regions import SLACK
 from gdpro_sim.simulation.scene import Scene, check_scene
+from gdpro_sim.simulation.solver_options import MpmOptions
 
 MIDDLE = np.ones(3)
 """m, of the simulated matter."""
@@ -68,6 +72,9 @@ CONDITION_KEYS = {
 PART_KEYS = {"point", "size", "E", "nu", "density"}
 """The same of `additional_material_params`."""
 
+FEW = 2
+"""Boxes that a message names."""
+
 
 @dataclass(frozen=True)
 class Converted:
@@ -99,6 +106,8 @@ def convert(
     scene["name"] = path.stem
     try:
         checked = check_scene({**scene, "folder": path.resolve().parent}, str(config))
+        if work.leave_out_empty(scene["bodies"][0], checked):
+            checked = check_scene({**scene, "folder": path.resolve().parent}, str(config))
     except SceneError as error:
         raise RequestError(str(error)) from None
     with atomic_write(path) as temporary:
@@ -400,14 +409,18 @@ class _Conversion:
         colliders: list[dict[str, Any]],
         solver: dict[str, Any],
     ) -> None:
+
+        def add(key: str, *items: dict[str, Any]) -> None:
+            body.setdefault(key, []).extend(items)
+
         kinds = {
             "cuboid": lambda: colliders.append(self._cuboid(condition)),
             "surface_collider": lambda: colliders.extend(self._plane(condition)),
             "bounding_box": lambda: solver.update(domain=self._walls()),
-            "particle_impulse": lambda: self._add(body, "impulses", self._impulse(condition)),
-            "enforce_particle_translation": lambda: self._add(body, "pins", self._translation(condition)),
-            "enforce_particle_velocity_rotation": lambda: self._add(body, "pins", self._spin(condition)),
-            "release_particles_sequentially": lambda: self._add(body, "pins", *self._release(condition)),
+            "particle_impulse": lambda: add("impulses", self._impulse(condition)),
+            "enforce_particle_translation": lambda: add("pins", self._translation(condition)),
+            "enforce_particle_velocity_rotation": lambda: add("pins", *self._spin(condition)),
+            "release_particles_sequentially": lambda: add("pins", *self._release(condition)),
         }
         found = condition.get("type")
         if found not in kinds:
@@ -416,21 +429,25 @@ class _Conversion:
         with self._reading(f"boundary condition {found!r}"):
             kinds[found]()
 
-    def _add(self, body: dict[str, Any], key: str, *items: dict[str, Any] | None) -> None:
-        for item in items:
-            if item is None or not self._holds_something(item):
+    def leave_out_empty(self, body: dict[str, Any], scene: Scene) -> bool:
+        """Leave out boxes that hold no particle: they mean nothing. Whether there were any."""
+        keys = [key for key in ("parts", "pins", "impulses") if key in body]
+        if not keys:
+            return False
+        assert isinstance(scene.solver, MpmOptions)
+        (points,) = starting_points(scene, scene.solver, load_assets(scene))
+        changed = False
+        for key in keys:
+            holds = [region.select(points).any() for region in getattr(scene.bodies[0], key)]
+            empty = [item for item, full in zip(body[key], holds, strict=True) if not full]
+            if not empty:
                 continue
-            body.setdefault(key, []).append(item)
-
-    def _holds_something(self, region: dict[str, Any]) -> bool:
-        """Whether any Gaussian of the cloud lies in a box of the scene; of a mesh nobody knows yet."""
-        if self.cloud is None or "minimum" not in region:
-            return True
-        points = (self.cloud - MIDDLE) @ self.turn.T + MIDDLE
-        inside = ((points >= region["minimum"]) & (points <= region["maximum"])).all(axis=1)
-        if not inside.any():
-            self.say(f"the box {region['minimum']} to {region['maximum']} m holds nothing: left out")
-        return bool(inside.any())
+            changed = True
+            body[key] = [item for item, full in zip(body[key], holds, strict=True) if full]
+            some = "; ".join(f"{item['minimum']} to {item['maximum']} m" for item in empty[:FEW])
+            rest = f" and {len(empty) - FEW} more" if len(empty) > FEW else ""
+            self.say(f"{key}: boxes that hold nothing are left out: {some}{rest}")
+        return changed
 
     def _cuboid(self, c: dict[str, Any]) -> dict[str, Any]:
         keys, start, end = self.window(c, "end")
@@ -490,12 +507,12 @@ class _Conversion:
             key["time"] += start
         return {**self.box(c["point"], c["size"]), **keys, **motion}
 
-    def _spin(self, c: dict[str, Any]) -> dict[str, Any] | None:
+    def _spin(self, c: dict[str, Any]) -> list[dict[str, Any]]:
         keys, start, end = self.window(c, "release")
         normal = np.asarray(c["normal"], float)
         if np.count_nonzero(normal) != 1:
             self.say(f"enforce_particle_velocity_rotation about {normal.tolist()}: only about axes, left out")
-            return None
+            return []
         self.say("enforce_particle_velocity_rotation: the box around the cylinder is held")
         axis, (height, radius) = int(np.abs(normal).argmax()), c["half_height_and_radius"]
         half = np.full(3, float(radius))
@@ -508,7 +525,7 @@ class _Conversion:
         if angle or shift:
             turned = {"translation": self.vector(shift * normal), "rotation": self.vector(angle * normal)}
             held.update(pivot=self.point(c["point"]), motion=[{"time": end, **turned}])
-        return held
+        return [held]
 
     def _release(self, c: dict[str, Any]) -> list[dict[str, Any]]:
         """Slabs on both sides of the end position, let go one after another from the outermost in."""
@@ -526,7 +543,7 @@ class _Conversion:
             for side in (-1.0, 1.0):
                 point, half = MIDDLE.copy(), np.ones(3)
                 point[axis] = near + side * step * (LAYERS - layer - 0.5)
-                half[axis] = 0.5 * step * (1.0 - 1e-5)
+                half[axis] = 0.5 * step - 2.0 * SLACK * self.number("scale", 1.0)  # no particle in two
                 slabs.append({**self.box(point, half), **keys})
         self.say(f"release_particles_sequentially: {LAYERS} layers, each let go as a whole")
         return slabs

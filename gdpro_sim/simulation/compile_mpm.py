@@ -117,6 +117,22 @@ def compile_particles(
 # ---- filling ----
 
 
+def starting_points(scene: Scene, options: MpmOptions, assets: dict[str, Asset]) -> list[np.ndarray]:
+    """Where the particles of each body stand at the start, [n, 3] float64 m each.
+
+    Raises SceneError for bodies that cannot be filled.
+    """
+    placements = place_bodies(scene, assets)
+    fillings: Fillings = {}
+    spacings, _ = _resolution(scene, options, placements, fillings)
+    found = []
+    for body, placement, spacing in zip(scene.bodies, placements, spacings, strict=True):
+        where = f"{scene.name}: body {body.name!r}"
+        filling = _filled(where, placement.asset, spacing, options.fill, scene.seed, fillings)
+        found.append(placement(filling.points))
+    return found
+
+
 Fillings = dict[tuple[int, float, str, int], Filling]
 
 
@@ -324,4 +340,4 @@ def _check_substeps(scene: Scene, particles: Particles, settings: MpmSettings, s
             )
 
 
-__all__ = ["check_supported", "compile_particles"]
+__all__ = ["check_supported", "compile_particles", "starting_points"]

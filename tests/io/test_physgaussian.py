@@ -19,13 +19,14 @@ from gdpro_sim.cli import main
 from gdpro_sim.errors import RequestError
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.cloud import import_cloud, is_cloud
+from gdpro_sim.io.describe import describe
 from gdpro_sim.io.physgaussian import Converted, convert
 from gdpro_sim.io.ply import write_ply
 from gdpro_sim.io.splat import TURNS
 from gdpro_sim.simulation.compile import compile_scene, load_assets
 from gdpro_sim.simulation.scene import load_scene
 
-BOX = {"point": [1, 1, 0.5], "size": [0.5, 0.4, 0.2]}
+BOX = {"point": [1, 1, 1.0], "size": [0.5, 0.4, 0.2]}
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +154,7 @@ def test_the_camera_stands_where_physgaussians_does(folder: Path, up: list[int],
 
 def test_boundary_conditions(folder: Path) -> None:
     rotation = {
-        "type": "enforce_particle_velocity_rotation", "point": [1, 1, 1.4], "normal": [0, 0, 1],
+        "type": "enforce_particle_velocity_rotation", "point": [1, 1, 1.1], "normal": [0, 0, 1],
         "half_height_and_radius": [0.2, 0.1], "rotation_scale": 2.0, "translation_scale": 0.5,
     }  # fmt: skip
     translation = {"type": "enforce_particle_translation", **BOX, "velocity": [0, 0.2, 0]}
@@ -176,11 +177,11 @@ def test_boundary_conditions(folder: Path) -> None:
     moved, turned, held = body.pins
     assert (moved.start, moved.release) == (0.25, 0.75) and moved.motion[-1].time == 0.75
     np.testing.assert_allclose(moved.motion[-1].translation, [0, 0.1, 0], atol=1e-7)
-    np.testing.assert_allclose([moved.minimum, moved.maximum], [[0.5, 0.6, 0.3], [1.5, 1.4, 0.7]])
+    np.testing.assert_allclose([moved.minimum, moved.maximum], [[0.5, 0.6, 0.8], [1.5, 1.4, 1.2]])
     # Against the normal: PhysGaussian's second axis is first x normal.
     np.testing.assert_allclose(turned.motion[0].rotation, [0, 0, -math.degrees(0.6)], rtol=1e-6)
     np.testing.assert_allclose(turned.motion[0].translation, [0, 0, 0.15])
-    assert turned.pivot == (1.0, 1.0, 1.4) and (turned.start, turned.release) == (0.0, 0.3)
+    assert turned.pivot == (1.0, 1.0, 1.1) and (turned.start, turned.release) == (0.0, 0.3)
     assert (held.start, held.release, held.motion) == (0.3, None, ())
 
 
@@ -194,6 +195,11 @@ def test_sequential_release_and_parts(folder: Path) -> None:
     times = {round(pin.minimum[0], 3): pin.release for pin in pins if pin.minimum is not None}
     assert times[0.5] == pytest.approx(1.5) and min(t for t in times.values() if t) == pytest.approx(0.03)
     assert all((pin.minimum or (0,))[0] > 0.45 for pin in pins), "slabs beside the matter are left out"
+    assert any("pins: boxes that hold nothing" in line and "more" in line for line in made.messages)
+    model = compile_scene(made.scene, load_assets(made.scene))
+    held = np.concatenate([hold.particles for hold in model.holds])
+    assert model.particles is not None
+    assert sorted(held) == np.flatnonzero(model.particles.positions[:, 0] < 1.5).tolist(), "each by one slab"
     late = converted(folder, "cloud.ply", boundary_conditions=[{**release, "start_time": 0.75}]).scene
     assert {pin.start for pin in late.bodies[0].pins} == {0.75}
     assert min(pin.release or 0.0 for pin in late.bodies[0].pins) > 0.75
@@ -314,6 +320,8 @@ def test_command_line(
 
 def test_clouds_are_told_from_meshes(folder: Path) -> None:
     assert is_cloud(folder / "cloud.ply") and not is_cloud(folder / "box.ply")
+    facts = describe(folder / "cloud.ply")
+    assert (facts["kind"], facts["gaussians"], facts["sh_degree"]) == ("splat cloud", 4001, 0)
     assert not is_cloud(folder / "missing.ply") and is_cloud("any.splat")
     asset = import_cloud(folder / "cloud.ply", up="z", scale=0.5)
     means = asset.gaussians.gaussians().means.numpy()
