@@ -207,7 +207,8 @@ def _run(
         },
         gravity=scene.gravity,
         ground=None if scene.ground is None else scene.ground.height,
-        links=simulation.obstacles[len(simulation.model.colliders) :],
+        colliders=model.colliders,
+        links=simulation.obstacles[len(model.colliders) :],
     ) as writer:
         for index in range(total):
             stored = store.load(index)

@@ -6,7 +6,7 @@
             Splats         ParticleField3DGaussianSplat: positions, orientations, scales, extent per frame
             Points         the same Gaussians for programs that drop splats (Blender)
             Tets           rest tetrahedra, with PhysicsMaterial
-        /Base              see `gdpro_sim.io.usd_links`
+        /Base, Obstacles   see `gdpro_sim.io.usd_links`
         Cameras, Lights    how the scene is seen, see `gdpro_sim.io.usd_views`
 
 Positions are the solver's float32 values in world space. Colours, opacities, topology and the binding are
@@ -33,7 +33,16 @@ from gdpro_sim.errors import AssetError, OutputError, RequestError
 from gdpro_sim.files import check_writable, commit_file, output_error, remove_quietly, temporary_beside
 from gdpro_sim.gaussians import Gaussians, sh_to_rgb
 from gdpro_sim.io.staging import Shot
-from gdpro_sim.io.usd_links import BASE, define_links, read_links, set_links
+from gdpro_sim.io.usd_links import (
+    BASE,
+    OBSTACLES,
+    define_links,
+    define_obstacles,
+    read_links,
+    read_obstacles,
+    set_links,
+    set_obstacles,
+)
 from gdpro_sim.io.usd_views import ViewPrims
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
@@ -98,7 +107,8 @@ class SimulationWriter:
     bodies:     in frame order; a compiled `Body` stands for its bare binding, `body_records` gives all
     gravity:    m/s^2, for other physics programs; None leaves it out
     ground:     height of the floor in m, for other physics programs; None leaves it out
-    links:      parts of a base; frames hold their poses after those of other colliders
+    colliders:  the scene's
+    links:      parts of a base; frames hold their poses after those of the colliders
 
     Raises RequestError where the path cannot be written, OutputError where writing fails.
     """
@@ -114,6 +124,7 @@ class SimulationWriter:
         metadata: dict[str, Any] | None = None,
         gravity: Sequence[float] | None = None,
         ground: float | None = None,
+        colliders: Sequence[Collider] = (),
         links: Sequence[Collider] = (),
     ) -> None:
         stage.check_suffix(path)
@@ -134,8 +145,9 @@ class SimulationWriter:
         self._animate_sh = animate_sh
         self._gravity = gravity
         self._ground = ground
-        self._links = tuple(links)
+        self._colliders, self._links = tuple(colliders), tuple(links)
         self._ops: list[Any] = []
+        self._obstacle_ops: dict[int, Any] = {}
         self._fps = float(fps)
         self._metadata = json.dumps(metadata or {}, allow_nan=False)
         self._prims: list[tuple[Usd.Prim, SplatPrims]] = []
@@ -217,8 +229,9 @@ class SimulationWriter:
             root.CreateAttribute("gdpro:colliders", prims.T.DoubleArray, True)
         for figure in fields(Diagnostics):
             root.CreateAttribute(_FIGURES + figure.name, _FIGURE_TYPES[str(figure.type)][0], True)
-        taken = {BASE}
+        taken = {BASE, OBSTACLES}
         self._ops = define_links(self._stage, root.GetPath(), self._links)
+        self._obstacle_ops = define_obstacles(self._stage, root.GetPath(), self._colliders)
         paths = []
         for record, body, sample in zip(self._records, frame.bodies, samples, strict=True):
             path = root.GetPath().AppendChild(_identifier(record.name, taken))
@@ -279,6 +292,7 @@ class SimulationWriter:
             root.GetAttribute("gdpro:colliders").Set(Vt.DoubleArray.FromNumpy(frame.colliders.ravel()), code)
         if self._ops and frame.colliders is not None:
             set_links(self._ops, frame.colliders[-len(self._ops) :], code)
+        set_obstacles(self._obstacle_ops, self._colliders, frame, code)
         for figure in fields(Diagnostics):
             to_usd = _FIGURE_TYPES[str(figure.type)][1]
             root.GetAttribute(_FIGURES + figure.name).Set(
@@ -408,6 +422,7 @@ class SimulationReader:
     times:    seconds of each frame
     bodies:   the `BodyRecord` of each body (binding, faces, colours, rest tets, material)
     links:    parts of a base as they are at the start
+    obstacles: surfaces of the scene's colliders as they are at the start, by number
     metadata: as given to the writer
 
     Raises AssetError for a missing, corrupt or foreign file.
@@ -431,6 +446,7 @@ class SimulationReader:
             self._paths = [Sdf.Path(p) for p in self._root.GetAttribute("gdpro:bodies").Get() or []]
             self.bodies = tuple(self._body(p) for p in self._paths)
             self.links = read_links(self._stage, self._root.GetPath())
+            self.obstacles = read_obstacles(self._stage, self._root.GetPath())
 
     def __len__(self) -> int:
         return len(self._codes)

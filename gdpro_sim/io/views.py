@@ -14,7 +14,7 @@ import numpy as np
 
 from gdpro_sim.asset import Asset, kind
 from gdpro_sim.device import resolve_device, serial_torch
-from gdpro_sim.errors import MeshError, RequestError, SceneError
+from gdpro_sim.errors import RequestError, SceneError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale
 from gdpro_sim.gaussians import Gaussians
 from gdpro_sim.io.images import frame_name, read_png, remove_frames_from, write_png, write_video
@@ -25,7 +25,7 @@ from gdpro_sim.io.staging import Scenery, Staging, named_cameras
 from gdpro_sim.io.turntable import studio_around, turntable_cameras
 from gdpro_sim.io.usd import SimulationReader
 from gdpro_sim.simulation.callbacks import Callback
-from gdpro_sim.simulation.colliders import Collider, compile_collider
+from gdpro_sim.simulation.colliders import Collider, MeshCollider, compile_collider
 from gdpro_sim.simulation.frame import Frame
 from gdpro_sim.simulation.scene import Scene, check_scene, read_mapping
 from gdpro_sim.simulation.view import MAIN
@@ -236,19 +236,22 @@ def _with_render(studio: Studio, scene: Scene) -> Studio:
 
 
 def _obstacles(reader: SimulationReader, device: str) -> Obstacles:
-    """What the bodies of a recorded scene meet, as far as its files are still found, and parts of a base."""
+    """What the bodies of a recorded scene meet, and parts of a base."""
     scene, preview = reader.metadata.get("scene"), reader.metadata.get("preview")
     if scene is None or preview is None or not (scene.get("colliders") or reader.links):
         return Obstacles((), np.zeros(3), np.ones(3), device)
     colliders: list[Collider] = []
-    for options in Scene.model_validate(scene).colliders:
+    for number, options in enumerate(Scene.model_validate(scene).colliders):
         if isinstance(options.motion, Callback):  # the frames say where it was: no code runs here
             options = options.model_copy(update={"motion": ()})
-        try:
-            colliders.append(compile_collider(options, lambda file: Path(reader.path).parent / file))
-        except MeshError as error:
-            logger.warning("a collider is not drawn: %s", error)
-            colliders.append(Collider(options.name, "box", visible=False))  # poses go by number
+        if isinstance(options, MeshCollider):
+            if options.visible and number not in reader.obstacles:
+                logger.warning("collider %r is not drawn: %s does not hold it", options.name, reader.path)
+            seen = reader.obstacles.get(number, Collider(options.name, "box", visible=False))
+            motion = options.compiled(np.asarray(options.position)) if options.motion else None
+            colliders.append(replace(seen, motion=motion))
+        else:
+            colliders.append(compile_collider(options))
     return Obstacles(
         [*colliders, *reader.links], np.asarray(preview["low"]), np.asarray(preview["high"]), device
     )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import import_mesh
@@ -84,16 +85,33 @@ def test_a_recorded_run_shows_its_obstacles_again(tmp_path: Path) -> None:
     pictures = []
     for name, more in (
         ("bare", ""),
-        ("with", "colliders: {kind: sphere, radius: 0.1, position: [0, 0, 0.1]}\n"),
+        (
+            "with",
+            "colliders:\n"
+            "- {kind: sphere, radius: 0.1, position: [0, 0, 0.1]}\n"
+            "- {kind: mesh, file: block.ply, position: [0.2, 0, 0.1],\n"
+            "   motion: {time: 0.1, rotation: [0, 0, 40]}}\n"
+            "- {kind: plane, position: [0, 0, -1]}\n",
+        ),
     ):
         (tmp_path / f"{name}.yaml").write_text(text + more)
         run = record(tmp_path / f"{name}.yaml", tmp_path / name)
-        again = render_file(run.simulation, tmp_path / f"{name}_again")
+        (tmp_path / f"{name}_moved").mkdir()  # the files of the scene are not beside it any more
+        moved = run.simulation.rename(tmp_path / f"{name}_moved/simulation.usdc")
+        again = render_file(moved, tmp_path / f"{name}_again")
         assert len(again) == run.frame_count
         for index, path in enumerate(again):
             first = read_png(run.frames / path.name).astype(int)
             assert np.abs(first - read_png(path)).max() <= 2, index
         pictures.append(first)
+    stage = Usd.Stage.Open(str(moved))
+    block = stage.GetPrimAtPath("/Simulation/Obstacles/mesh_1")
+    turned = np.array(UsdGeom.Xformable(block).GetLocalTransformation(Usd.TimeCode(run.frame_count - 1)))
+    point = np.array([0.25, 0, 0.1, 1]) @ turned  # half a side from the pivot
+    angle = np.radians(40)
+    assert np.allclose(point[:3], [0.2 + 0.05 * np.cos(angle), 0.05 * np.sin(angle), 0.1])
+    assert not stage.GetPrimAtPath("/Simulation/Obstacles/sphere_0").GetAttribute("xformOpOrder").Get()
+    assert len(stage.GetPrimAtPath("/Simulation/Obstacles").GetChildren()) == 2
     assert np.abs(pictures[1] - pictures[0]).max() > 50
 
 
