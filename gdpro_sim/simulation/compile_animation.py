@@ -17,7 +17,7 @@ from gdpro_sim.simulation.animation.follow import SurfaceFollower, fit_to_surfac
 from gdpro_sim.simulation.animation.solver import AnimatedBody
 from gdpro_sim.simulation.animation_options import BodyAnimation
 from gdpro_sim.simulation.colliders import compile_collider
-from gdpro_sim.simulation.model import Body, Ground, Model, Particles
+from gdpro_sim.simulation.model import Body, Ground, Model
 from gdpro_sim.simulation.placement import Placement, place_bodies
 from gdpro_sim.simulation.scene import Scene
 from gdpro_sim.simulation.scene_body import SceneBody
@@ -94,19 +94,14 @@ def compile_animation(scene: Scene, assets: dict[str, Asset], *, device: str = "
         if body.source not in riding:
             riding[body.source] = _riding(scene, body, assets[body.name])
         animation.append(_animated(scene, body, *riding[body.source], assets[body.name], placement))
-    none = Particles(
-        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32),
-        np.zeros(0, np.int32), (), 0.0,
-    )  # fmt: skip
-    model = Model.of_particles(
-        none,
+    model = Model.without_tets(
         bodies=tuple(bodies),
         gravity=scene.gravity,
         ground=None if scene.ground is None else Ground(scene.ground.height),
         colliders=tuple(compile_collider(item, scene.resolve) for item in scene.colliders),
         device=device,
     )
-    return replace(model, particles=None, animation=tuple(animation))
+    return replace(model, animation=tuple(animation))
 
 
 def _open(scene: Scene, body: SceneBody) -> Motion:

@@ -102,7 +102,7 @@ def compile_particles(
     _check_domain(scene, bodies, particles, settings)
     _check_cells(scene, particles, settings, grid_spacing)
     _check_substeps(scene, particles, settings, grid_spacing)
-    model = Model.of_particles(
+    model = Model.without_tets(
         particles,
         bodies=tuple(bodies),
         gravity=scene.gravity,

@@ -25,7 +25,7 @@ from gdpro_sim.simulation.colliders import PlaneCollider, compile_collider
 from gdpro_sim.simulation.compile_forces import Placed, chosen_pins
 from gdpro_sim.simulation.compile_mujoco_forces import apply_loads
 from gdpro_sim.simulation.conditions import Motion
-from gdpro_sim.simulation.model import Body, Ground, Model, Particles
+from gdpro_sim.simulation.model import Body, Ground, Model
 from gdpro_sim.simulation.mujoco_model import (
     Control,
     Joint,
@@ -131,19 +131,14 @@ def compile_mujoco(
                 item.name, item.restitution,
             )  # fmt: skip
     world = replace(_base(scene, options), bodies=tuple(made), settings=options.settings(soft))
-    none = Particles(
-        np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32),
-        np.zeros(0, np.int32), (), 0.0,
-    )  # fmt: skip
-    model = Model.of_particles(
-        none,
+    model = Model.without_tets(
         bodies=tuple(bodies),
         gravity=scene.gravity,
         ground=None if scene.ground is None else Ground(scene.ground.height),
         colliders=tuple(compile_collider(item, scene.resolve) for item in scene.colliders),
         device=device,
     )
-    return apply_loads(scene, _numbered(replace(model, particles=None, mujoco=world), assets))
+    return apply_loads(scene, _numbered(replace(model, mujoco=world), assets))
 
 
 def _base(scene: Scene, options: MujocoOptions) -> MujocoWorld:

@@ -261,8 +261,8 @@ class Model:
     coupling: Coupling | None = None
 
     @staticmethod
-    def of_particles(
-        particles: Particles,
+    def without_tets(
+        particles: Particles | None = None,
         *,
         bodies: tuple[Body, ...] = (),
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
@@ -273,7 +273,7 @@ class Model:
         loads: tuple[Load, ...] = (),
         device: str = "cpu",
     ) -> Model:
-        """A model without tets."""
+        """A model of particles, or of nothing that deforms by tets."""
         none = np.zeros(0, np.float32)
         return Model(
             bodies=bodies,

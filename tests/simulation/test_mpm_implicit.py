@@ -51,7 +51,7 @@ def bar(counts: tuple[int, int, int], size: tuple[float, float, float], **materi
 
 def solver_of(particles: Particles, settings: dict[str, Any] | None = None, **options: Any) -> SolverMPM:
     settings = {"integrator": "implicit", **(settings or {})}
-    return SolverMPM(Model.of_particles(particles, mpm=MpmSettings(**settings), **options))
+    return SolverMPM(Model.without_tets(particles, mpm=MpmSettings(**settings), **options))
 
 
 def total_energy(found: Diagnostics) -> float:

@@ -65,7 +65,7 @@ def block(
         materials=(material,),
         spacing=spacing,
     )
-    return SolverMPM(Model.of_particles(cloud, gravity=(0.0, 0.0, 0.0), mpm=MpmSettings(grid_spacing=dx)))
+    return SolverMPM(Model.without_tets(cloud, gravity=(0.0, 0.0, 0.0), mpm=MpmSettings(grid_spacing=dx)))
 
 
 @pytest.mark.parametrize(("speed", "tears"), [(1.5, True), (0.3, False)])
@@ -107,7 +107,7 @@ def test_a_lone_particle_of_damped_matter_falls_as_it_is() -> None:
     x = np.array([[0.011, 0.023, 0.5], [0.3, 0.2, 0.6]], np.float32)
     material = np.zeros(2, np.int32)
     matter = Particles(x, np.zeros_like(x), np.full(2, 2.8e-7, np.float32), material, (jelly,), 6.6e-3)
-    solver = SolverMPM(Model.of_particles(matter))
+    solver = SolverMPM(Model.without_tets(matter))
     solver.step(0.1)
     assert solver.diagnostics().elastic_energy < 1e-12
     assert np.abs(np.linalg.det(solver.deformations) - 1.0).max() < 1e-5

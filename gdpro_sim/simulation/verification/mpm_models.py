@@ -114,7 +114,7 @@ def make_model(
         float(np.cbrt(points.volumes.mean())),
         None if gradients is None else np.broadcast_to(gradients, (count, 3, 3)).astype(np.float32),
     )
-    return Model.of_particles(
+    return Model.without_tets(
         particles,
         gravity=gravity,
         ground=ground,
