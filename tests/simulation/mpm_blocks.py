@@ -53,7 +53,7 @@ def block(
         materials=(material,),
         spacing=spacing,
     )
-    return Model.of_particles(particles, **model)
+    return Model.without_tets(particles, **model)
 
 
 def run(solver: SolverMPM, seconds: float, frame: float = 1.0 / 60.0) -> SolverMPM:
