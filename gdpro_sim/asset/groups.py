@@ -1,4 +1,4 @@
-"""Named vertex groups of an imported mesh: one for each material, and those painted as mask images."""
+"""Named vertex groups of an imported mesh: its materials, its named parts, and those painted as images."""
 
 from __future__ import annotations
 
@@ -16,23 +16,25 @@ from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.surface import SurfaceMesh
 
 MOST = 64
-"""More materials than this are no groups that anybody would name."""
+"""More materials or parts than this are no groups that anybody would name."""
 
 
-def material_groups(mesh: SurfaceMesh, bound: BoundGaussians) -> dict[str, np.ndarray]:
-    """Vertices of `bound` by the names of the mesh's materials, where it has several; ascending int32 ids.
+def named_groups(mesh: SurfaceMesh, bound: BoundGaussians) -> dict[str, np.ndarray]:
+    """Vertices of `bound` by the names of the mesh's parts, and of its materials where it has several.
 
-    Vertices on a border belong to both sides. Materials of one name are one group.
+    Ascending int32 ids. Vertices on a border belong to both sides. Materials of one name are one group, which
+    stands for a part of that name, too.
     """
-    names = [material.name for material in mesh.materials]
-    if not 1 < len(set(names)) <= MOST:
+    names = dict.fromkeys(material.name for material in mesh.materials)
+    owners = np.array([material.name for material in mesh.materials])[mesh.material_ids]
+    chosen = dict(mesh.groups) if len(mesh.groups) <= MOST else {}
+    if 1 < len(names) <= MOST:
+        chosen |= {name: owners == name for name in names if name}
+    if not chosen:
         return {}
     faces = to_numpy(bound.faces)
     nearest, _ = _centres(mesh, bound)
-    owners = np.array(names)[mesh.material_ids[nearest]]
-    groups = {
-        name: np.unique(faces[owners == name]).astype(np.int32) for name in dict.fromkeys(names) if name
-    }
+    groups = {name: np.unique(faces[own[nearest]]).astype(np.int32) for name, own in chosen.items()}
     return {name: ids for name, ids in groups.items() if len(ids)}
 
 
@@ -64,4 +66,4 @@ def _centres(mesh: SurfaceMesh, bound: BoundGaussians) -> tuple[np.ndarray, np.n
     return SurfaceIndex(mesh.vertices, mesh.faces).closest(middles)
 
 
-__all__ = ["mask_groups", "material_groups"]
+__all__ = ["mask_groups", "named_groups"]

@@ -13,7 +13,7 @@ import numpy as np
 
 from gdpro_sim.asset.asset import Asset
 from gdpro_sim.asset.from_mesh import bind_mesh, vertex_colors
-from gdpro_sim.asset.groups import mask_groups, material_groups
+from gdpro_sim.asset.groups import mask_groups, named_groups
 from gdpro_sim.asset.prims import to_numpy
 from gdpro_sim.asset.stage import kind
 from gdpro_sim.errors import AssetError, MeshError
@@ -58,7 +58,7 @@ def import_mesh(
     target_tets, edge_length (m), tet_method: as in `gdpro_sim.meshing.tetrahedralize.tetrahedralize`
     seed:        of every random draw; Gaussians repeat to the bit, fTetWild's tets do not
     masks:       images over the mesh's UV map by name: what they paint white becomes a vertex group; each of
-                 several materials is a group of its own
+                 several materials, group of an OBJ and subset of faces in USD is one of its own
     on_progress: called with the name of each phase as it begins
 
     >>> import_mesh("bunny.obj", budget=20_000).save("bunny.usdc")  # doctest: +SKIP
@@ -141,7 +141,7 @@ def bind_asset(
         vertex_colors=vertex_colors(mesh, bound),
         material=material,
         provenance=provenance,
-        groups=material_groups(mesh, bound),
+        groups=named_groups(mesh, bound),
     )
     if tets:
         asset = tetrahedralize_asset(

@@ -167,6 +167,7 @@ def merge_parts(parts: list[RawPart]) -> RawPart:
     colors = np.full((len(faces), 3, 4), 255, np.uint8) if any(p.colors is not None for p in parts) else None
     ids = np.empty(len(faces), np.int32)
     materials: list[MeshMaterial] = []
+    groups = {name: np.zeros(len(faces), bool) for part in parts for name in part.groups}
     for part in parts:
         rows = slice(row, row + len(part.faces))
         faces[rows] += offset
@@ -175,9 +176,11 @@ def merge_parts(parts: list[RawPart]) -> RawPart:
             uv[rows] = part.uv
         if colors is not None and part.colors is not None:
             colors[rows] = part.colors
+        for name, own in part.groups.items():
+            groups[name][rows] = own
         offset, row, material = offset + len(part.vertices), rows.stop, material + len(part.materials)
         materials += part.materials
-    return RawPart(np.concatenate([p.vertices for p in parts]), faces, ids, materials, uv, colors)
+    return RawPart(np.concatenate([p.vertices for p in parts]), faces, ids, materials, uv, colors, groups)
 
 
 def _keep(part: RawPart, mask: np.ndarray) -> RawPart:
@@ -188,6 +191,7 @@ def _keep(part: RawPart, mask: np.ndarray) -> RawPart:
         part.materials,
         part.uv[mask] if part.uv is not None else None,
         part.colors[mask] if part.colors is not None else None,
+        {name: own[mask] for name, own in part.groups.items()},
     )
 
 
@@ -302,6 +306,7 @@ def _finish(part: RawPart, path: Path, raw: RawMesh) -> SurfaceMesh:
         str(path),
         sha256_of(path) if path.is_file() else "",
         tuple(messages),
+        part.groups,
     )
 
 

@@ -21,7 +21,10 @@ size."""
 
 @dataclass
 class RawPart:
-    """One piece: vertices [V, 3] float64 (node transforms applied), faces [F, 3], per-corner attributes."""
+    """One piece: vertices [V, 3] float64 (node transforms applied), faces [F, 3], per-corner attributes.
+
+    groups: [F] bool of the faces in each, by the file's names for parts that are no materials
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -29,6 +32,7 @@ class RawPart:
     materials: list[MeshMaterial]
     uv: np.ndarray | None = None
     colors: np.ndarray | None = None
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,6 +42,7 @@ class SurfaceMesh:
     source:       the file it came from ("" when made in memory)
     sha256:       of the file's bytes ("" when made in memory)
     messages:     what the reader noticed, repaired or assumed; one sentence each
+    groups:       [F] bool of the faces in each, by the file's names for parts that are no materials
     """
 
     vertices: np.ndarray
@@ -52,6 +54,7 @@ class SurfaceMesh:
     source: str = ""
     sha256: str = ""
     messages: tuple[str, ...] = ()
+    groups: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         f = len(self.faces)

@@ -10,6 +10,8 @@ import numpy as np
 
 from gdpro_sim.errors import MeshError
 from gdpro_sim.meshing.color import linear_to_srgb
+from gdpro_sim.meshing.obj_file import read_obj
+from gdpro_sim.meshing.proximity import SurfaceIndex
 from gdpro_sim.meshing.rawmesh import MAX_FACES, WHITE, RawMesh, RawPart, image_array, too_many_faces
 from gdpro_sim.meshing.surface import DEFAULT_COLOR, MeshMaterial
 
@@ -61,6 +63,7 @@ def read_trimesh(path: Path) -> RawMesh:
         _declared_unit(scene, raw)
     elif kind == ".obj":
         _missing_obj_files(path, raw.messages)
+        _obj_groups(path, raw.parts)
     return raw
 
 
@@ -180,6 +183,25 @@ def _declared_unit(scene: Any, raw: RawMesh) -> None:
             raw.unit = float(unit_conversion(str(units), "meters"))
         except Exception:  # an unknown name
             raw.messages.append(f"unit {units!r} is unknown and was read as metres")
+
+
+def _obj_groups(path: Path, parts: list[RawPart]) -> None:
+    """Tell parts which of their faces are in which of the file's groups, by where they are."""
+    data = path.read_bytes()
+    if not data.startswith((b"g ", b"o ")) and b"\ng " not in data and b"\no " not in data:
+        return
+    found = read_obj(path)
+    triangles, polygons = found.triangles()
+    inside = ((triangles >= 0) & (triangles < len(found.points))).all(axis=1)
+    triangles, polygons = triangles[inside], polygons[inside]
+    groups = {name: np.isin(polygons, ids) for name, ids in found.groups.items()}
+    groups = {name: own for name, own in groups.items() if not own.all()}
+    if not groups:
+        return
+    index = SurfaceIndex(found.points, triangles)
+    for part in parts:
+        nearest, _ = index.closest(part.vertices[part.faces].mean(axis=1))
+        part.groups = {name: own[nearest] for name, own in groups.items()}
 
 
 def _missing_obj_files(path: Path, messages: list[str]) -> None:

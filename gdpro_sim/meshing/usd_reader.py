@@ -131,7 +131,7 @@ def _part(mesh: Any, matrix: np.ndarray, time: Any, messages: list[str]) -> RawP
     if all(m.name == "" for m in materials):
         colors = _display_color(prim, time, local, polygon, corners, len(vertices))
         materials = [MeshMaterial("displayColor", WHITE) if colors is not None else MeshMaterial()]
-    return RawPart(vertices, corners[local], ids, materials, uv, colors)
+    return RawPart(vertices, corners[local], ids, materials, uv, colors, _groups(prim, polygon))
 
 
 def triangulate(
@@ -280,6 +280,18 @@ def _materials(prim: Any, polygon: np.ndarray, messages: list[str]) -> tuple[lis
         ids[np.isin(polygon, np.asarray(subset.GetIndicesAttr().Get(), np.int64))] = len(materials)
         materials.append(_material(subset.GetPrim(), messages))
     return materials, ids
+
+
+def _groups(prim: Any, polygon: np.ndarray) -> dict[str, np.ndarray]:
+    """Subsets of faces that have no material of their own, [T] bool of the triangles in each."""
+    from pxr import UsdGeom, UsdShade
+
+    return {
+        str(subset.GetPrim().GetName()): np.isin(polygon, np.asarray(subset.GetIndicesAttr().Get(), np.int64))
+        for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim))
+        if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.face
+        and not UsdShade.MaterialBindingAPI(subset.GetPrim()).GetDirectBinding().GetMaterial()
+    }
 
 
 def _material(prim: Any, messages: list[str]) -> MeshMaterial:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from pxr import Usd, UsdGeom
 
 from gdpro_sim.asset import Asset, import_mesh
 from gdpro_sim.cli import main
@@ -109,6 +110,33 @@ def write_slab(folder: Path) -> Path:
     (folder / "two.obj").write_text("\n".join(lines))
     (folder / "two.mtl").write_text("newmtl left\nKd 1 0 0\nnewmtl right\nKd 0 0 1\n")
     return folder / "two.obj"
+
+
+def test_named_parts_of_a_mesh_become_groups(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box((1, 1, 1)).subdivide()
+    top = mesh.triangles_center[:, 2] > 0.49
+    right = mesh.triangles_center[:, 0] > 0.49
+    lines = ["g", "o Box", *(f"v {x} {y} {z}" for x, y, z in mesh.vertices)]
+    for names, faces in (("", ~top & ~right), ("lid red", top), ("side", right)):
+        lines += [f"g {names}", *(f"f {a} {b} {c}" for a, b, c in mesh.faces[faces] + 1)]
+    (tmp_path / "box.obj").write_text("\n".join(lines))
+    stage = Usd.Stage.CreateNew(str(tmp_path / "box.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    prim = UsdGeom.Mesh.Define(stage, "/Box")
+    prim.CreatePointsAttr(mesh.vertices.astype(np.float32))
+    prim.CreateFaceVertexCountsAttr([3] * len(mesh.faces))
+    prim.CreateFaceVertexIndicesAttr(mesh.faces.ravel().astype(np.int32))
+    for name, faces in (("lid", top), ("side", right)):
+        UsdGeom.Subset.CreateGeomSubset(prim, name, "face", np.flatnonzero(faces).tolist())
+    stage.Save()
+    expected = {"box.obj": {"lid", "red", "side"}, "box.usda": {"lid", "side"}}
+    for file, names in expected.items():
+        asset = import_mesh(tmp_path / file, budget=300, tets=False, up="z")
+        points = asset.gaussians.vertices.numpy()
+        assert set(asset.groups) == names
+        assert set(asset.groups["lid"]) == set(np.flatnonzero(points[:, 2] > 0.49))
+        assert set(asset.groups["side"]) == set(np.flatnonzero(points[:, 0] > 0.49))
 
 
 def test_materials_and_masks_of_a_mesh_become_groups(tmp_path: Path) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gdpro_sim.errors import MeshError
 from gdpro_sim.meshing.load import SUPPORTED, check_file, merge_parts, read_raw
+from gdpro_sim.meshing.obj_file import ObjFile, read_obj
 from gdpro_sim.meshing.rawmesh import WHITE, RawMesh, RawPart
 from gdpro_sim.meshing.repair import check_arrays
 from gdpro_sim.meshing.surface import MeshMaterial
@@ -161,42 +161,17 @@ def _topology(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Mesh readers split an OBJ's vertices where its normals differ, frame by frame; here they stand as written.
     """
-    if file.suffix.lower() == ".obj":
-        return _obj(file)
     check_file(file)
+    if file.suffix.lower() == ".obj":
+        found = read_obj(file)
+        return found.points, found.polygons
     part = merge_parts(read_raw(file).parts)
     return part.vertices, part.faces
 
 
-def _obj(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    check_file(file)
-    points: list[bytes] = []
-    polygons: list[int] = []
-    try:
-        for line in file.read_bytes().splitlines():
-            if line.startswith(b"v "):
-                points.append(b" ".join(line.split()[1:4]))
-            elif line.startswith(b"f "):
-                corners = [int(corner.split(b"/")[0]) for corner in line.split()[1:]]
-                polygons += [len(corners), *(c - 1 if c > 0 else len(points) + c for c in corners)]
-        numbers = np.array(b" ".join(points).split(), dtype=np.float64)
-    except ValueError as error:
-        raise MeshError(f"{file}: cannot be read as OBJ ({error}); the file is damaged") from error
-    if not polygons or len(numbers) != 3 * len(points):
-        raise MeshError(f"{file}: holds no triangles; export a triangle mesh")
-    return numbers.reshape(-1, 3), np.asarray(polygons, np.int64)
-
-
 def _triangles(file: Path, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     if faces.ndim == 1:
-        fans: list[tuple[int, int, int]] = []
-        rest: Sequence[int] = faces.tolist()
-        at = 0
-        while at < len(rest):
-            corners = rest[at + 1 : at + 1 + rest[at]]
-            fans += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
-            at += 1 + rest[at]
-        faces = np.asarray(fans, np.int64).reshape(-1, 3)
+        faces, _ = ObjFile(points, faces).triangles()
     check_arrays(points, faces, str(file))
     return faces.astype(np.int32)
 
