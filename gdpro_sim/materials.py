@@ -274,7 +274,8 @@ class Material(BaseModel):
         if isinstance(value, dict) and value.get("yield_stress") is not None:
             value = {"model": "stvk_hencky", **value}
         if isinstance(value, dict) and isinstance(value.get("bulk_modulus"), (int, float)):
-            value = {"young": 3.0 * value["bulk_modulus"], "poisson": 0.0, **value}
+            bulk = value["bulk_modulus"]  # a wrong one is told of by its own name
+            value = {"young": 3.0 * bulk if bulk > 0.0 else 1.0, "poisson": 0.0, **value}
         return value
 
     @field_validator(

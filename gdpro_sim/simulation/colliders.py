@@ -269,7 +269,7 @@ def mesh_collider(vertices: np.ndarray, faces: np.ndarray, *, name: str = "mesh"
             f"{report.volume:.3g} m^3); close it, or use boxes"
         )
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    room = min(0.5 * ROOM * _thickness(vertices, faces), MESH_ROOM * size)
+    room = min(0.5 * ROOM * mesh_thickness(vertices, faces), MESH_ROOM * size)
     return Collider(
         name,
         "mesh",
@@ -281,7 +281,7 @@ def mesh_collider(vertices: np.ndarray, faces: np.ndarray, *, name: str = "mesh"
     )
 
 
-def _thickness(vertices: np.ndarray, faces: np.ndarray) -> float:
+def mesh_thickness(vertices: np.ndarray, faces: np.ndarray) -> float:
     """How far the other side is straight behind a face, m: the twentieth part of the faces has less."""
     normals = face_normals(vertices, faces)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -339,5 +339,6 @@ __all__ = [
     "SphereCollider",
     "compile_collider",
     "mesh_collider",
+    "mesh_thickness",
     "shape_collider",
 ]

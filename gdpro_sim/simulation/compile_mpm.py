@@ -14,6 +14,7 @@ from gdpro_sim.binding import BoundGaussians
 from gdpro_sim.errors import MeshError, SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.fill import Filling, Pattern, fill_bound, fill_tets
+from gdpro_sim.meshing.lattice import NO_VOLUME
 from gdpro_sim.meshing.repair import validate
 from gdpro_sim.simulation.colliders import compile_collider
 from gdpro_sim.simulation.compile_forces import Placed, chosen_pins, compile_pushes
@@ -30,6 +31,9 @@ PARTICLES = 30_000
 
 ROUGH = 24
 """Particles along a body's longest side in the filling that measures its volume."""
+
+NOTHING = 1.0e-7
+"""Volume over the longest side's cube below which a body is none: a leaf a thousandth as thick has 1e-3."""
 
 CLOSE = 0.35
 """Particles of two bodies that are nearer than this, in spacings, are in each other: filled space has one
@@ -65,6 +69,11 @@ def compile_particles(
         count = len(filling)
         own, within = materials_at(body, placement.asset, filling.points)
         made = (*own, *(part.material for part in body.parts))
+        if any(item.model == "linear" for item in made):
+            raise SceneError(
+                f'{where}: the law "linear" means nothing for bodies that turn, and MPM bodies may; choose '
+                '"stable_neo_hookean", or the FEM solver'
+            )
         if options.integrator == "implicit" and any(flows(item) for item in made):
             raise SceneError(
                 f"{where}: its material flows, yields or tears, which the implicit integrator cannot do; use "
@@ -145,10 +154,12 @@ def _resolution(
     volumes = []
     for body, placement in zip(scene.bodies, placements, strict=True):
         size = float(np.ptp(placement.surface, axis=0).max())
-        rough = _filled(
-            f"{scene.name}: body {body.name!r}", placement.asset, size / ROUGH, "lattice", 0, known
-        )
-        volumes.append(float(rough.volumes.sum(dtype=np.float64)))
+        where = f"{scene.name}: body {body.name!r}"
+        rough = _filled(where, placement.asset, size / ROUGH, "lattice", 0, known)
+        volume = float(rough.volumes.sum(dtype=np.float64))
+        if volume < NOTHING * size**3:
+            raise SceneError(f"{where}: {NO_VOLUME}")
+        volumes.append(volume)
     if options.grid_spacing is not None:
         common = options.grid_spacing / cell
     else:
@@ -283,11 +294,16 @@ def _check_apart(scene: Scene, bodies: list[Body], particles: Particles, spacing
         distance, _ = cKDTree(near_b).query(near_a, distance_upper_bound=CLOSE * spacing)
         inside = np.isfinite(distance)
         if inside.sum() > FEW:
-            middle = np.round(near_a[inside].mean(axis=0), 3).tolist()
+            middle = _rounded(near_a[inside].mean(axis=0))
             raise SceneError(
                 f"{scene.name}: bodies {bodies[i].name!r} and {bodies[j].name!r} overlap at the start, "
                 f"around {middle} m; move them apart"
             )
+
+
+def _rounded(point: np.ndarray) -> list[float]:
+    """[3] m for messages."""
+    return [float(f"{x:.3g}") + 0.0 for x in point]
 
 
 def _check_domain(scene: Scene, bodies: list[Body], particles: Particles, settings: MpmSettings) -> None:
@@ -299,7 +315,7 @@ def _check_domain(scene: Scene, bodies: list[Body], particles: Particles, settin
         points = particles.positions[slice(*body.particle_range)]
         outside = ((points < low) | (points > high)).any(axis=1)
         if outside.any():
-            least, most = (np.round(end, 3).tolist() for end in (points.min(axis=0), points.max(axis=0)))
+            least, most = _rounded(points.min(axis=0)), _rounded(points.max(axis=0))
             raise SceneError(
                 f"{scene.name}: body {body.name!r} reaches from {least} to {most} m, outside solver.domain "
                 f"{low.tolist()} to {high.tolist()}: move it, or the walls"

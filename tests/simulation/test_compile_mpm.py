@@ -197,6 +197,18 @@ def test_clouds_without_a_mesh_are_filled(tmp_path: Path) -> None:
         ),
         ({"position": [0, 0, -1]}, {}, {}, "starts 1 m below the ground"),
         (
+            {"material": {"preset": "jelly", "model": "linear"}},
+            {},
+            {},
+            "body 'cube': the law \"linear\" means",
+        ),
+        (
+            {"material": {"preset": "water", "bulk_modulus": 0}},
+            {},
+            {},
+            "material.bulk_modulus: must be greater",
+        ),
+        (
             {"material": "steel"},
             {},
             {"max_substeps": 100},
@@ -243,11 +255,11 @@ def test_overlapping_bodies_are_refused(cube: Asset) -> None:
 
 
 def test_open_meshes_are_filled_by_their_tets_or_refused(cube: Asset) -> None:
-    sheet = replace(
-        cube.gaussians, faces=cube.gaussians.faces[:2], face_ids=torch.zeros_like(cube.gaussians.face_ids)
-    )
-    with pytest.raises(SceneError, match="body 'cube': "):
-        compiled(replace(cube, gaussians=sheet))
+    for faces in (cube.gaussians.faces[:2], cube.gaussians.faces[:1]):
+        ids = torch.zeros_like(cube.gaussians.face_ids)
+        sheet = replace(cube.gaussians, faces=faces, face_ids=ids)
+        with pytest.raises(SceneError, match=r"body 'cube': .*the mesh encloses no volume"):
+            compiled(replace(cube, gaussians=sheet))
 
 
 def test_fem_refuses_what_is_for_mpm(cube: Asset) -> None:

@@ -514,5 +514,20 @@ def test_fem_refuses_what_only_mpm_knows() -> None:
 
 def test_a_thin_collider_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
     shelf = collider(kind="box", name="shelf", size=(1.0, 1.0, 0.05), position=(0.0, 0.0, -0.1))
-    SolverMPM(block(colliders=(shelf,))).step(1e-3)
-    assert "'shelf' is 0.05 m thick" in caplog.text
+    board = box_mesh((1.0, 1.0, 0.04), name="board", position=np.array([0.0, 0.0, -0.3]))
+    crate = box_mesh((1.0, 1.0, 0.4), name="crate", position=np.array([0.0, 0.0, -0.6]))
+    hill = collider(
+        kind="heightfield", name="hill", size=(1.0, 1.0), heights=[[0, 0], [0, 0]], position=(0, 0, -1)
+    )
+    SolverMPM(block(colliders=(shelf, board, crate, hill))).step(1e-3)
+    assert "'shelf' is 0.05 m thick" in caplog.text and "'board' has parts 0.04 m thick" in caplog.text
+    assert "crate" not in caplog.text and "hill" not in caplog.text
+
+
+def test_matter_that_starts_inside_a_collider_is_refused() -> None:
+    crate = {"kind": "box", "name": "crate", "size": (1.0, 1.0, 0.4), "position": (0.0, 0.0, -0.08)}
+    with pytest.raises(
+        SolverError, match=r"starts 0\.107 m inside collider 'crate', more than a cell of 0\.05"
+    ):
+        SolverMPM(block(colliders=(collider(**crate),)))
+    SolverMPM(block(colliders=(collider(**crate, boundary="sticky"), collider(**crate, start=1.0))))

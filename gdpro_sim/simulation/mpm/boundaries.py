@@ -17,13 +17,15 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from gdpro_sim.device import Launches
 from gdpro_sim.errors import SolverError
 from gdpro_sim.kernels import mpm_boundary as kernels
 from gdpro_sim.kernels import mpm_drivers, mpm_gaps
+from gdpro_sim.kernels.colliders import signed_distances
 from gdpro_sim.kernels.mpm_transfer import tile_width
 from gdpro_sim.simulation.collider_shapes import KINDS as COLLIDER_KINDS
 from gdpro_sim.simulation.collider_shapes import ColliderShape, placed
-from gdpro_sim.simulation.colliders import ROOM, Collider
+from gdpro_sim.simulation.colliders import ROOM, Collider, mesh_thickness
 from gdpro_sim.simulation.conditions import FOREVER, Guide
 from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mpm.drivers import Holds, Loads, corners, top_speed
@@ -127,6 +129,11 @@ class Obstacles:
         around = model.particles.positions.astype(np.float64)
         self._corners = [_corners_of(item, around) for item in self.items]
         self._driven = 0.0
+        cell = model.mpm.grid_spacing or 2.0 * model.particles.spacing
+        for c in range(len(self.items))[self._colliders]:
+            item = self.items[c]
+            if item.boundary != "sticky" and item.start == 0.0 and c not in self.guided:
+                _check_outside(model, item, self._structs[c], cell)
 
     def plan(self, time: float, dt: float) -> None:
         self._taken.zero_()
@@ -428,11 +435,16 @@ class Obstacles:
             )
         for item in self.items:
             thickness = 2.0 * item.room / ROOM
-            if item.kind not in ("plane", "mesh") and thickness < 2.0 * spacing:
+            if item.kind == "plane" or item.heights is not None:  # as deep as need be
+                continue
+            if item.vertices is not None and item.faces is not None:
+                thickness = mesh_thickness(item.vertices, item.faces)
+            if thickness < 2.0 * spacing:
                 log.warning(
-                    "collider %r is %.3g m thick, less than two cells of %.3g m: matter may pass through it; "
+                    "collider %r %s %.3g m thick, less than two cells of %.3g m: matter may pass through; "
                     "make it thicker, or cells smaller",
                     item.name,
+                    "is" if item.vertices is None else "has parts",
                     thickness,
                     spacing,
                 )
@@ -492,6 +504,29 @@ def _obstacles(model: Model) -> tuple[list[Collider], int]:
                 turn[:, 1] *= sign
                 found.append(Collider("wall", "plane", position=corner, rotation=turn, friction=0.0))
     return found, first
+
+
+def _check_outside(model: Model, item: Collider, shape: Any, cell: float) -> None:
+    """Raise SolverError for matter that starts deeper inside a collider than a cell of `cell` m.
+
+    What sticks is left alone: it may hold matter that is inside.
+    """
+    assert model.particles is not None
+    points: wp.array = wp.array(
+        model.particles.positions.astype(np.float64), dtype=wp.vec3d, device=model.device
+    )
+    distance: wp.array = wp.zeros(len(points), dtype=wp.float64, device=model.device)
+    normal: wp.array = wp.zeros(len(points), dtype=wp.vec3d, device=model.device)
+    Launches(model.device)(signed_distances, len(points), [shape, points], [distance, normal], minimum=4096)
+    depth = -distance.numpy()
+    deepest = int(np.argmax(depth))
+    if depth[deepest] > cell:
+        names = [b.name for b in model.bodies if b.particle_range[0] <= deepest < b.particle_range[1]]
+        body = f"body {names[0]!r}" if names else f"particle {deepest}"
+        raise SolverError(
+            f"{body} starts {depth[deepest]:.3g} m inside collider {item.name!r}, more than a cell of "
+            f"{cell:.3g} m; move one of them, or let the collider hold what is in it (`boundary: sticky`)"
+        )
 
 
 def _outside(model: Model, low: np.ndarray, high: np.ndarray) -> int:

@@ -161,7 +161,8 @@ class SolverMPM:
                     way = "make cells larger"
                 raise SolverError(
                     f"{settings.integrator} substeps of {left / count:.3g} s would be needed "
-                    f"{self._counters.substeps + count:,} times in a step of {dt:.3g} s (at most "
+                    f"{self._counters.substeps + count:,} times in the step of {dt:.3g} s from t = "
+                    f"{begin:.6g} s on (at most "
                     f"{settings.max_substeps:,}): {way}"
                 )
             h = left / count
