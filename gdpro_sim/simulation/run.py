@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,6 +19,11 @@ from gdpro_sim.simulation.conditions import Motion, pose_at
 from gdpro_sim.simulation.frame import BodyFrame, Frame
 from gdpro_sim.simulation.model import Diagnostics, Model, Solver
 from gdpro_sim.simulation.scene import Scene, load_scene
+
+log = logging.getLogger(__name__)
+
+OVERLAP = 0.05
+"""Share of its size that a body may start inside a base without a warning."""
 
 
 class Simulation:
@@ -47,10 +53,22 @@ class Simulation:
     def advance(self, index: int) -> None:
         """Bring the solver from frame `index - 1` to frame `index`; frame 0 is the initial state."""
         begin = time.perf_counter()
+        if index == 1:
+            self._tell_of_overlaps()
         if index > 0:
             self.solver.step(1.0 / self.scene.fps)
         self._time = index / self.scene.fps
         self.milliseconds["solve"] = 1e3 * (time.perf_counter() - begin)
+
+    def _tell_of_overlaps(self) -> None:
+        """Bodies that start inside a base are pushed out at once: they may fly, or be torn."""
+        sizes = {body.name: float(np.ptp(body.surface, axis=0).max()) for body in self.model.bodies}
+        for name, part, depth in getattr(self.solver, "overlaps", list)():
+            if depth > OVERLAP * sizes[name]:
+                log.warning(
+                    "body %r starts %.2g m inside %r of the base, which pushes it out: move it, or the base",
+                    name, depth, part,
+                )  # fmt: skip
 
     def surfaces(self) -> list[np.ndarray]:
         """Deformed surface vertices of every body, [V, 3] float32 m."""

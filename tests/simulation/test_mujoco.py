@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from gdpro_sim.errors import SceneError, SolverError
 from gdpro_sim.simulation.colliders import Collider
@@ -16,7 +17,7 @@ from gdpro_sim.simulation.model import Solver
 from gdpro_sim.simulation.mujoco import SolverMuJoCo
 from gdpro_sim.simulation.mujoco.contacts import damping_of, restitution_of
 from gdpro_sim.simulation.mujoco.soft import grid
-from gdpro_sim.simulation.mujoco_model import Control, Joint, MujocoWorld
+from gdpro_sim.simulation.mujoco_model import Control, Joint, MujocoWorld, Shape
 from gdpro_sim.simulation.verification.models import tet_box
 from gdpro_sim.simulation.verification.mujoco_models import ball, box, flex, world
 
@@ -206,3 +207,47 @@ def test_bad_bases_are_refused(tmp_path: Path, text: str, changes: dict, message
     broken = replace(model, mujoco=replace(model.mujoco, base=tmp_path / "base.xml", **changes))
     with pytest.raises(SceneError, match=message):
         SolverMuJoCo(broken)
+
+
+GREEDY = """
+<mujoco>
+  <compiler boundmass="0.5" boundinertia="0.1" settotalmass="50" fusestatic="true" inertiafromgeom="true"/>
+  <default>
+    <geom margin="0.1" friction="0" contype="0" conaffinity="0"/>
+    <joint stiffness="10" damping="30" armature="2"/>
+    <mesh scale="0.001 0.001 0.001"/>
+  </default>
+  <worldbody>
+    <body name="own" pos="5 0 0"><joint/><geom size="0.1"/></body>
+    <body name="still" pos="3 0 0"><geom size="0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_what_a_base_sets_for_its_parts_does_not_reach_bodies(tmp_path: Path) -> None:
+    (tmp_path / "base.xml").write_text(GREEDY)
+    half = 0.05
+    corners = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    solid = Shape("mesh", vertices=corners, faces=ConvexHull(corners).simplices)
+    body = replace(box((half,) * 3, np.array([0.0, 0.0, 0.5])), shapes=(solid,), mass=0.01)
+    body = replace(body, inertia=body.inertia * 1e-2)
+    found = []
+    for base in (None, tmp_path / "base.xml"):
+        model = world(body, ground=True)
+        assert model.mujoco is not None
+        solver = SolverMuJoCo(replace(model, mujoco=replace(model.mujoco, base=base)))
+        for _ in range(20):
+            solver.step(FRAME)
+        found.append(solver.surface_positions(0)[0])
+    assert solver.mjmodel.body_mass.tolist() == pytest.approx([0.0, 25.0, 25.0, 0.01])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-3)
+    assert found[1][2] == pytest.approx(half, abs=1e-3)
+
+
+def test_bodies_that_start_inside_a_base_are_named(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(ARM)
+    model = world(box((0.05, 0.05, 0.05), np.array([0.4, 0.0, 1.0])), ball(0.1, 3.0))
+    assert model.mujoco is not None
+    (told,) = SolverMuJoCo(replace(model, mujoco=replace(model.mujoco, base=tmp_path / "arm.xml"))).overlaps()
+    assert told[:2] == ("box", "arm") and 0.05 < told[2] < 0.1

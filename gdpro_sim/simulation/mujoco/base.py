@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import re
+import warnings
 from pathlib import Path
 
 import mujoco
@@ -10,6 +13,8 @@ import numpy as np
 
 from gdpro_sim.errors import SceneError
 from gdpro_sim.simulation.mujoco_model import MujocoWorld
+
+log = logging.getLogger(__name__)
 
 
 def read_base(world: MujocoWorld) -> tuple[mujoco.MjSpec, tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
@@ -24,12 +29,18 @@ def read_base(world: MujocoWorld) -> tuple[mujoco.MjSpec, tuple[np.ndarray, np.n
     if not world.base.is_file():
         raise SceneError(f"{world.base}: no such file")
     try:
-        spec = mujoco.MjSpec.from_file(str(world.base))
-        alone = spec.copy().compile()
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            spec = mujoco.MjSpec.from_file(str(world.base))
+            spec.compiler.fusestatic = False
+            alone = spec.compile()
+        for item in said:
+            log.debug("%s: %s", world.base, " ".join(str(item.message).split()))
     except (ValueError, mujoco.FatalError) as error:
         message = " ".join(str(error).split())
         place = _place(world.base, message)
         raise SceneError(f"{world.base}: MuJoCo cannot compile it: {message}{place}") from None
+    _keep_masses(spec, alone)
     names = [key.name for key in spec.keys]
     for key in list(spec.keys):  # they would have to name the joints of our bodies, too
         spec.delete(key)
@@ -40,6 +51,22 @@ def read_base(world: MujocoWorld) -> tuple[mujoco.MjSpec, tuple[np.ndarray, np.n
         return spec, None
     k = names.index(world.keyframe)
     return spec, (alone.key_qpos[k].copy(), alone.key_qvel[k].copy(), alone.key_ctrl[k].copy())
+
+
+def _keep_masses(spec: mujoco.MjSpec, alone: mujoco.MjModel) -> None:
+    """Give every body of the base the mass it has `alone`, and put off what its compiler does to masses
+    (least ones, a total, inertia from geoms): it would do it to ours."""
+    for body in spec.bodies[1:]:
+        if alone.body_mass[body.id] > 0.0:
+            body.explicitinertial = True
+            body.mass, body.ipos = float(alone.body_mass[body.id]), alone.body_ipos[body.id]
+            body.iquat, body.inertia = alone.body_iquat[body.id], alone.body_inertia[body.id]
+            body.fullinertia = [math.nan] * 6
+    compiler = spec.compiler
+    compiler.boundmass = compiler.boundinertia = 0.0
+    compiler.settotalmass = -1.0
+    compiler.balanceinertia = False
+    compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
 
 
 def _check_known(what: str, wanted: list[str], names: list[str]) -> None:

@@ -27,6 +27,10 @@ SHARE = 0.95
 
 IMPEDANCE = (SHARE, SHARE, 0.001, 0.5, 2.0)
 
+_OWN = mujoco.MjSpec()
+DEFAULT = _OWN.default
+"""MuJoCo's own defaults: what we add has none of those that a base sets for its parts."""
+
 FLEX_REFERENCE = (0.01, 1.0)
 """`solref` of what touches a flex: time constant in s, and damping ratio."""
 
@@ -60,7 +64,7 @@ def reference(restitution: float, timestep: float) -> tuple[float, float]:
 
 
 def set_contact(item: Any, friction: float, solref: tuple[float, float], *, condim: int = 3) -> None:
-    """Contact parameters of a geom or flex, all of them: a base's defaults must not reach it."""
+    """Contact parameters of a geom or flex."""
     item.contype = item.conaffinity = 1
     item.condim, item.priority = condim, 0
     item.friction = [friction, 0.005, 0.0001]
@@ -70,7 +74,7 @@ def set_contact(item: Any, friction: float, solref: tuple[float, float], *, cond
 
 def add_pair(spec: mujoco.MjSpec, a: Any, b: Any, friction: float, solref: tuple[float, float]) -> None:
     """Friction of two geoms that is neither's own."""
-    pair = spec.add_pair()
+    pair = spec.add_pair(DEFAULT)
     pair.geomname1, pair.geomname2 = a.name, b.name
     pair.condim, pair.margin, pair.gap = 3, 0.0, 0.0
     pair.friction = [friction, friction, 0.005, 0.0001, 0.0001]
@@ -78,6 +82,7 @@ def add_pair(spec: mujoco.MjSpec, a: Any, b: Any, friction: float, solref: tuple
 
 
 __all__ = [
+    "DEFAULT",
     "FLEX_REFERENCE",
     "IMPEDANCE",
     "LEAST",

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gdpro_sim.simulation.mujoco.contacts import reference, set_contact
+from gdpro_sim.simulation.mujoco.contacts import DEFAULT, reference, set_contact
 from gdpro_sim.simulation.mujoco_model import RigidBody, Shape
 
 GEOMS = {
@@ -54,7 +54,7 @@ def add_rigid(
     set_mass(added, body.mass, body.inertia)
     joint = body.joint
     if joint.kind != "fixed":
-        item = added.add_joint(name=name, type=JOINTS[joint.kind])
+        item = added.add_joint(DEFAULT, name=name, type=JOINTS[joint.kind])
         if joint.kind == "free":
             item.align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
         else:
@@ -66,9 +66,6 @@ def add_rigid(
             if joint.limits is not None:
                 item.limited = mujoco.mjtLimited.mjLIMITED_TRUE
                 item.range = [float(np.degrees(x)) if degrees else x for x in joint.limits]
-            else:
-                item.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-        item.armature, item.frictionloss = 0.0, 0.0
     return added, add_shapes(spec, added, body.shapes, name, body.friction, solref)
 
 
@@ -79,9 +76,8 @@ def add_driven(spec: mujoco.MjSpec, name: str, mass: float, size: float = 1.0) -
     """
     added = spec.worldbody.add_body(name=name, gravcomp=1.0)
     set_mass(added, HEAVY * mass, HEAVY * mass * size * size * np.eye(3))
-    item = added.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_FREE)
+    item = added.add_joint(DEFAULT, name=name, type=mujoco.mjtJoint.mjJNT_FREE)
     item.align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
-    item.armature, item.frictionloss, item.damping = 0.0, 0.0, [0.0] * 3
     return added
 
 
@@ -119,11 +115,11 @@ def add_shapes(
     geoms = []
     for k, shape in enumerate(shapes):
         title = f"{name}_{k}" if len(shapes) > 1 else name
-        geom = added.add_geom(name=title)
+        geom = added.add_geom(DEFAULT, name=title)
         geom.pos, geom.quat = shape.position.tolist(), quaternion(shape.rotation)
         if shape.kind == "mesh":
             assert shape.vertices is not None and shape.faces is not None
-            mesh = spec.add_mesh(name=title)
+            mesh = spec.add_mesh(DEFAULT, name=title)
             mesh.uservert = np.asarray(shape.vertices, np.float64).ravel().tolist()
             mesh.userface = np.asarray(shape.faces).ravel().tolist()
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, title

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gdpro_sim.errors import SceneError
-from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, set_contact
+from gdpro_sim.simulation.mujoco.contacts import DEFAULT, FLEX_REFERENCE, set_contact
 from gdpro_sim.simulation.mujoco.rigid import COLOR, add_driven
 from gdpro_sim.simulation.mujoco_model import SoftBody
 
@@ -75,9 +75,7 @@ def add_soft(
         point.explicitinertial, point.mass = True, max(float(masses[i]), least)
         point.ipos, point.inertia = [0.0, 0.0, 0.0], [1e-6 * max(float(masses[i]), least)] * 3
         for axis in np.eye(3).tolist():
-            item = point.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-            item.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-            item.armature, item.damping, item.frictionloss = 0.0, [0.0] * 3, 0.0
+            point.add_joint(DEFAULT, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
     owners = [
         names[leader[i]] or (drivers[driver[i]][0] if driver[i] >= 0 else "world")
         for i in range(len(positions))

@@ -279,6 +279,25 @@ class SolverMuJoCo:
         """[L, 3, 4] rotation and shift m of every of `links` since the start."""
         return poses_since(self._view, self._shown, self._linked)
 
+    def overlaps(self) -> list[tuple[str, str, float]]:
+        """(body, part of the base, m) of bodies that are inside a base now, each where it is deepest."""
+        owners = {
+            self.mjmodel.body(name).id: i for i, name in enumerate(self.world.names) if i not in self.flexes
+        }
+        flexes = {flex: i for i, flex in self.flexes.items()}
+        deepest: dict[int, tuple[str, str, float]] = {}
+        for contact in self._view.contact:
+            for side in (0, 1):
+                geom, other = int(contact.geom[side]), int(contact.geom[1 - side])
+                if geom < 0 or self.mjmodel.geom(geom).name in self.world.geoms:
+                    continue
+                body = owners.get(int(self.mjmodel.geom_bodyid[other]), -1) if other >= 0 else -1
+                body = flexes.get(int(contact.flex[1 - side]), body)
+                if body >= 0 and -contact.dist > deepest.get(body, ("", "", 0.0))[2]:
+                    part = self.mjmodel.body(int(self.mjmodel.geom_bodyid[geom])).name
+                    deepest[body] = self.bodies[body].name, part, -float(contact.dist)
+        return list(deepest.values())
+
     def frames(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [B, 3, 3] and centres of mass [B, 3] m of MuJoCo's own bodies by their `numbers` [B]."""
         turns = self._view.xmat[numbers].reshape(-1, 3, 3)

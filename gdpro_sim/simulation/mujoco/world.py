@@ -17,7 +17,14 @@ from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.model import Model
 from gdpro_sim.simulation.mujoco import rigid, soft
 from gdpro_sim.simulation.mujoco.base import read_base
-from gdpro_sim.simulation.mujoco.contacts import FLEX_REFERENCE, LEAST, add_pair, reference, set_contact
+from gdpro_sim.simulation.mujoco.contacts import (
+    DEFAULT,
+    FLEX_REFERENCE,
+    LEAST,
+    add_pair,
+    reference,
+    set_contact,
+)
 from gdpro_sim.simulation.mujoco_model import MujocoWorld, RigidBody, Shape, SoftBody
 
 log = logging.getLogger(__name__)
@@ -102,7 +109,7 @@ def build(model: Model) -> World:
         _weld(spec, names[a], names[b], step)
     ours = [geom.name for _, shapes, _ in geoms for geom in shapes]
     if model.ground is not None:
-        floor = spec.worldbody.add_geom(name=name("ground"), type=mujoco.mjtGeom.mjGEOM_PLANE)
+        floor = spec.worldbody.add_geom(DEFAULT, name=name("ground"), type=mujoco.mjtGeom.mjGEOM_PLANE)
         floor.pos, floor.size = [0.0, 0.0, model.ground.height], [0.0, 0.0, 1.0]
         _passive(floor, 0.0)
         ours.append(floor.name)
@@ -201,7 +208,7 @@ def _weigh(
 
 def _weld(spec: mujoco.MjSpec, a: str, b: str, step: float) -> None:
     """Hold two bodies to each other as they stand; they do not touch then."""
-    held = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+    held = spec.add_equality(DEFAULT, type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
     held.name1, held.name2 = a, b
     data = np.zeros_like(held.data)  # a relative pose without a quaternion is that of the start
     data[10] = 1.0  # torques count as much as forces
@@ -249,7 +256,7 @@ def _obstacle(
     else:
         turn = collider.rotation
     if collider.kind == "plane":
-        geom = parent.add_geom(name=title, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+        geom = parent.add_geom(DEFAULT, name=title, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
         geom.pos, geom.quat = shift.tolist(), rigid.quaternion(turn)
         made = [geom]
     elif collider.heights is not None:
@@ -282,7 +289,7 @@ def _terrain(spec: mujoco.MjSpec, parent: Any, collider: Collider, title: str) -
         name=title, nrow=rows, ncol=columns, userdata=((collider.heights - least) / span).ravel().tolist(),
         size=[*(0.5 * (high - low)[:2]).tolist(), span, least - float(low[2])],
     )  # fmt: skip
-    return parent.add_geom(name=title, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=title)
+    return parent.add_geom(DEFAULT, name=title, type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=title)
 
 
 def _middle(collider: Collider) -> np.ndarray:
