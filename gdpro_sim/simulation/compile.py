@@ -28,8 +28,8 @@ from gdpro_sim.simulation.compile_coupled import as_part, compile_coupled, coupl
 from gdpro_sim.simulation.compile_forces import apply_conditions, distance_outside
 from gdpro_sim.simulation.compile_mpm import check_supported as mpm_supports
 from gdpro_sim.simulation.compile_mpm import compile_particles
+from gdpro_sim.simulation.compile_mujoco import check_base_file, compile_mujoco, prepare
 from gdpro_sim.simulation.compile_mujoco import check_supported as mujoco_supports
-from gdpro_sim.simulation.compile_mujoco import compile_mujoco, prepare
 from gdpro_sim.simulation.copies import colored
 from gdpro_sim.simulation.group_materials import materials_at
 from gdpro_sim.simulation.model import Body, Ground, Model
@@ -58,11 +58,7 @@ def check_files(scene: Scene) -> None:
         if body.animation is not None and not motion_file(scene, body).exists():
             path = motion_file(scene, body)
             raise SceneError(f"{scene.name}: bodies[{body.name}].animation.file: {path}: no such file")
-    rigid = scene.mujoco_options
-    if rigid is not None and rigid.base is not None and not scene.resolve(rigid.base).is_file():
-        path = scene.resolve(rigid.base)
-        key = "solver.base" if rigid is scene.solver else "solver.mujoco.base"
-        raise SceneError(f"{scene.name}: {key}: {path}: no such file")
+    check_base_file(scene)
     for k, collider in enumerate(scene.colliders):
         if isinstance(collider, MeshCollider) and not scene.resolve(collider.file).exists():
             path = scene.resolve(collider.file)

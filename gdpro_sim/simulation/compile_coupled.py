@@ -285,9 +285,11 @@ def _warn_small(model: Model, solids: tuple[Collider, ...]) -> None:
         small = {item.name: _thickness(item) for item in solids if _thickness(item) < length / math.sqrt(3.0)}
         if small:
             name, size = min(small.items(), key=lambda pair: pair[1])
+            wanted = len(tets) * (length / (math.sqrt(3.0) * size)) ** 3
             log.warning(
-                "%s (half thickness %.3g m) may sink in between vertices of body %r, whose triangles have "
-                "edges of %.3g m: give it more `tets`", name, size, body.name, length,
+                "%r (half thickness %.3g m) may sink in between the vertices of %r, which alone touch, up to "
+                "%.3g m apart: give %r about %s `tets`", name, size, body.name, length, body.name,
+                f"{float(f'{wanted:.1g}'):,.0f}",
             )  # fmt: skip
 
 

@@ -361,6 +361,14 @@ def _three(values: np.ndarray) -> tuple[float, float, float]:
 # ---- checks ----
 
 
+def check_base_file(scene: Scene) -> None:
+    """Raise SceneError where the file of a base does not exist."""
+    options = scene.mujoco_options
+    if options is not None and options.base is not None and not scene.resolve(options.base).is_file():
+        key = "solver.base" if options is scene.solver else "solver.mujoco.base"
+        raise SceneError(f"{scene.name}: {key}: {scene.resolve(options.base)}: no such file")
+
+
 def check_supported(scene: Scene) -> None:
     """Raise SceneError for what only other solvers can do, and for a base that MuJoCo cannot read."""
     for body in scene.bodies:
@@ -385,6 +393,7 @@ def check_supported(scene: Scene) -> None:
             raise SceneError(f"{where}: `boundary`, `start` and `end` are MPM's; leave them out")
         if collider.mass is not None:
             raise SceneError(f"{where}.mass: is MPM's; in MuJoCo make it a body, which is rigid or soft")
+    check_base_file(scene)
     options = scene.mujoco_options
     if options is not None and options.base is not None:
         from gdpro_sim.simulation.mujoco.base import read_base  # brings MuJoCo
@@ -396,6 +405,7 @@ __all__ = [
     "FULL_TETS",
     "REDUCED_TETS",
     "RESTITUTION",
+    "check_base_file",
     "check_supported",
     "compile_mujoco",
     "form_of",

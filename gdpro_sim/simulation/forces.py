@@ -31,7 +31,8 @@ class Pin(Region, Moving):
     def _something(self) -> Pin:
         if not self.chosen:
             raise ValueError(
-                "give a box (minimum, maximum), a sphere (center, radius), a side or vertices to pin"
+                "give a box (minimum, maximum), a sphere (center, radius), a side, group, painted colour or "
+                "vertices to pin"
             )
         return self
 

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from gdpro_sim.simulation.callbacks import Callback, taken
 from gdpro_sim.simulation.mujoco_model import JointKind, MujocoSettings
-from gdpro_sim.simulation.options import Number, Options, Vector
+from gdpro_sim.simulation.options import Number, Options, Vector, several
 
 SOFT = MujocoSettings(timestep=2e-3, tolerance=1e-6, impratio=1.0)
 """With soft bodies, whose contacts take conjugate gradients many iterations."""
@@ -69,6 +69,11 @@ class MujocoOptions(Options):
     @classmethod
     def _function(cls, value: Any) -> Any:
         return taken(value)
+
+    @field_validator("controls", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        return {name: several(keys) for name, keys in value.items()} if isinstance(value, dict) else value
 
     @field_validator("controls")
     @classmethod
