@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -31,6 +31,9 @@ Vector = tuple[float, float, float]
 
 UNSTATED = "not stated"
 """Licence of a part whose provenance has no "license"."""
+
+NOBODY = "none: made from words by the built-in generator"
+"""Licence of a part in which there is nothing of anybody else's: no mesh, no photos, no trained weights."""
 
 
 @dataclass(frozen=True)
@@ -310,12 +313,23 @@ def _tell_apart(asset: Asset, names: Sequence[str], counts: Sequence[int]) -> No
         )  # fmt: skip
 
 
+def licenses(provenance: Mapping[str, Any]) -> list[str]:
+    """Of what an asset with this provenance is made of."""
+    if "license" in provenance:
+        return [str(provenance["license"])]
+    if "composed_of" in provenance:
+        return [str(one) for one in provenance["licenses"]]
+    made = [provenance.get(key) for key in ("guidance", "prior")]
+    own = all(isinstance(item, dict) and item.get("kind") == "procedural" for item in made)
+    return [NOBODY if own else UNSTATED]
+
+
 def _provenance(items: Sequence[ComposedPart], names: Sequence[str]) -> dict[str, Any]:
     listed = [
         {
             "name": label,
             "sha256": item.asset.digest,
-            "license": item.asset.provenance.get("license", UNSTATED),
+            "license": ", ".join(licenses(item.asset.provenance)),
             "position": list(item.position),
             "rotation": list(item.rotation),
             "scale": _factor(item, label),
@@ -326,9 +340,9 @@ def _provenance(items: Sequence[ComposedPart], names: Sequence[str]) -> dict[str
     ]
     return {
         "composed_of": listed,
-        "licenses": sorted({str(entry["license"]) for entry in listed}),
+        "licenses": sorted({one for item in items for one in licenses(item.asset.provenance)}),
         "versions": versions(),
     }
 
 
-__all__ = ["Anchor", "ComposedPart", "anchor_point", "compose"]
+__all__ = ["Anchor", "ComposedPart", "anchor_point", "compose", "licenses"]

@@ -46,6 +46,7 @@ def import_mesh(
     tet_method: str = "auto",
     seed: int = 0,
     masks: Mapping[str, str | Path] | None = None,
+    license: str | None = None,
     on_progress: Phase | None = None,
 ) -> Asset:
     """Make an asset of a mesh file.
@@ -59,6 +60,7 @@ def import_mesh(
     seed:        of every random draw; Gaussians repeat to the bit, fTetWild's tets do not
     masks:       images over the mesh's UV map by name: what they paint white becomes a vertex group; each of
                  several materials, group of an OBJ and subset of faces in USD is one of its own
+    license:     the mesh's, kept in the asset's provenance and in that of what is composed of it
     on_progress: called with the name of each phase as it begins
 
     >>> import_mesh("bunny.obj", budget=20_000).save("bunny.usdc")  # doctest: +SKIP
@@ -100,6 +102,8 @@ def import_mesh(
     if masks:
         painted = mask_groups(path, masks, asset.gaussians, up=up, scale=scale)
         asset = replace(asset, groups={**asset.groups, **painted})
+    if license is not None:
+        asset = replace(asset, provenance={**asset.provenance, "license": license})
     return asset
 
 

@@ -57,6 +57,9 @@ def import_command(
         list[str] | None,
         typer.Option("--mask", help="NAME=IMAGE over the UV map: what it paints white is a vertex group."),
     ] = None,
+    license: Annotated[
+        str | None, typer.Option("--license", help="The mesh's licence, kept in the asset.")
+    ] = None,
     seed: Seed = None,
     json_output: AsJson = False,
     quiet: Quiet = False,
@@ -77,8 +80,10 @@ def import_command(
 
     cloud = is_cloud(mesh)
     check_choice("--up", up, ("auto", "y", "z", "x", "-x", "-y", "-z") if cloud else ("auto", "y", "z"))
-    if cloud and (color is not None or texture is not None or mask):
-        raise RequestError(f"--color, --texture and --mask are for meshes, but {mesh} is a splat cloud")
+    if cloud and (color is not None or texture is not None or mask or license is not None):
+        raise RequestError(
+            f"--color, --texture, --mask and --license are for meshes, but {mesh} is a splat cloud"
+        )
     masks = {}
     for given in mask or []:
         name, _, image = given.partition("=")
@@ -111,6 +116,7 @@ def import_command(
                 target_tets=tets or 6_000,
                 seed=seed or 0,
                 masks=masks,
+                license=license,
                 on_progress=lambda phase: report(phase, 0, 0),
             )
         )

@@ -37,6 +37,7 @@ class PartOptions(Options):
     position: Vector = Field(default=(0.0, 0.0, 0.0), description="m")
     rotation: Vector = Field(default=(0.0, 0.0, 0.0), description="degrees about X, then Y, then Z")
     material: Material | None = Field(default=None, description="default: the asset's")
+    license: str | None = Field(default=None, min_length=1, description="default: the asset's")
 
     @model_validator(mode="after")
     def _one_source(self) -> PartOptions:
@@ -152,6 +153,8 @@ def _loaded(
         )
     if part.material is not None:
         asset = replace(asset, material=part.material, group_materials={})
+    if part.license is not None:
+        asset = replace(asset, provenance={**asset.provenance, "license": part.license})
     return asset
 
 

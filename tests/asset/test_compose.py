@@ -131,6 +131,20 @@ def test_everything_of_every_part_is_kept(tmp_path: Path, caplog: pytest.LogCapt
     )
 
 
+def test_licences_of_what_a_part_is_made_of() -> None:
+    words = {"guidance": {"kind": "procedural"}, "prior": {"kind": "procedural"}}
+    scanned = {**words, "prior": {"kind": "mesh"}}
+    made = [replace(ball(f"b{k}"), provenance=found) for k, found in enumerate(
+        (words, scanned, {"license": "CC0"}))]  # fmt: skip
+    inner = compose(made[1:], target_tets=0)
+    assert inner.provenance["licenses"] == ["CC0", "not stated"]
+    whole = compose([made[0], inner], target_tets=0)
+    assert whole.provenance["licenses"] == [
+        "CC0", "none: made from words by the built-in generator", "not stated"
+    ]  # fmt: skip
+    assert whole.provenance["composed_of"][1]["license"] == "CC0, not stated"
+
+
 def test_tets_are_dropped_where_a_part_has_none(caplog: pytest.LogCaptureFixture) -> None:
     whole = compose([plain("one"), ball("bare")], glue=False)
     assert whole.tets is None and "tets dropped, because part 'bare' has none" in caplog.text
@@ -227,12 +241,16 @@ def test_compositions_are_written_in_yaml_and_on_the_command_line(
     code, said, _ = gdpro("compose", "man.yaml", "-o", "a.usdc", "--json")
     assert code == 0 and json.loads(said)["groups"] == {"ball": 182, "head": 182}
     parts = ["--part", "ball.usdc anchor=bottom"]
-    parts += ["--part", "ball.usdc name=head size=1 anchor=bottom position=0,0,1.8 material=wood"]
+    parts += [
+        "--part",
+        "ball.usdc name=head size=1 anchor=bottom position=0,0,1.8 material=wood license='CC BY 4.0'",
+    ]
     assert gdpro("compose", *parts, "-o", "b.usdc", "--tets", "0", "-q")[0] == 0
     one, other = Asset.load("a.usdc"), Asset.load("b.usdc")
     assert torch.equal(one.gaussians.vertices, other.gaussians.vertices)
     assert one.summary()["bounds_max"][2] == pytest.approx(2.8, rel=1e-6)
     assert other.group_materials["head"].preset == "wood"
+    assert other.provenance["licenses"] == ["CC BY 4.0", "not stated"]
     for arguments, expected in (
         (["-o", "x.usdc"], "either a composition file or --part"),
         (["missing.yaml", "-o", "x.usdc"], "missing.yaml: no such file"),
