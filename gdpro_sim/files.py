@@ -9,8 +9,11 @@ import os
 import re
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+import filelock
 
 from gdpro_sim.errors import OutputError, RequestError
 
@@ -46,6 +49,27 @@ def prepare_folder(folder: str | Path, file: str) -> Path:
         raise RequestError(f"output folder {path} cannot be made: {error.strerror or error}") from None
     check_writable(path / file)
     return path
+
+
+@contextlib.contextmanager
+def claimed(folder: str | Path) -> Iterator[None]:
+    """Keep other runs on this machine out of `folder`, which need not exist yet.
+
+    Raises RequestError where one writes there already. The claim ends with the process, killed or not.
+    """
+    place = f"{os.path.expanduser('~')} {os.path.realpath(folder)}"  # users cannot open each other's locks
+    name = hashlib.sha256(os.fsencode(place)).hexdigest()[:24]
+    lock = filelock.FileLock(Path(tempfile.gettempdir()) / f"gdpro-{name}.lock", blocking=False)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise RequestError(
+            f"{folder}: another run writes there; wait for its end, or give another folder"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def temporary_beside(target: Path) -> Path:
@@ -122,6 +146,7 @@ def sha256_of(path: str | Path) -> str:
 __all__ = [
     "atomic_write",
     "check_writable",
+    "claimed",
     "commit_file",
     "output_error",
     "prepare_folder",

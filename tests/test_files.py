@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+import gdpro_sim
 from gdpro_sim.errors import OutputError, RequestError
-from gdpro_sim.files import atomic_write, check_writable, sha256_of
+from gdpro_sim.files import atomic_write, check_writable, claimed, sha256_of
 from tests.conditions import posix_only
 
 
@@ -62,3 +65,31 @@ def test_only_regular_files_are_replaced(tmp_path: Path) -> None:
     ):
         with pytest.raises(RequestError, match=message):
             check_writable(path)
+
+
+@posix_only
+def test_one_run_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
+    code = "import sys; from gdpro_sim.files import claimed\nwith claimed(sys.argv[1]): print(flush=True)"
+    code += "; input()"
+    out, link = tmp_path / "out", tmp_path / "link"
+    out.mkdir()
+    link.symlink_to(out)
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(out)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline()
+        for folder in (out, link):
+            with pytest.raises(RequestError, match="another run writes there"), claimed(folder):
+                pass
+        with claimed(tmp_path / "elsewhere"):
+            other.kill()
+    with claimed(out):
+        pass
+    assert os.listdir(out) == []
+
+
+@pytest.mark.parametrize("write", ["record", "rollout"])
+def test_a_folder_that_a_run_writes_to_is_refused(tmp_path: Path, write: str) -> None:
+    arguments = {"count": 1} if write == "rollout" else {}
+    with claimed(tmp_path), pytest.raises(RequestError, match="another run writes there"):
+        getattr(gdpro_sim, write)("tumbling_toys", tmp_path, **arguments)

@@ -26,7 +26,7 @@ import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device, serial_torch, set_thread_count, thread_count
 from gdpro_sim.errors import OutputError, RequestError, SceneError
-from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
+from gdpro_sim.files import atomic_write, claimed, prepare_folder, remove_stale, sha256_of
 from gdpro_sim.io.perception import CHANNELS, Photographer
 from gdpro_sim.io.record import fingerprint
 from gdpro_sim.simulation.callbacks import callbacks_of, with_code
@@ -145,8 +145,8 @@ def rollout(
 
     A dataset of the same scene, seed and options is continued where it was stopped, and made longer where
     `count` is larger. Raises RequestError (also SceneError, MeshError, AssetError, DeviceError) before
-    anything runs, OutputError later; finished rollouts stay. A rollout that MuJoCo cannot finish is kept as
-    far as it came, with the reason.
+    anything runs, also where another run writes into that folder, OutputError later; finished rollouts stay.
+    A rollout that MuJoCo cannot finish is kept as far as it came, with the reason.
 
         gdpro_sim.rollout("drop.yaml", "dataset", count=200, randomize={"bodies.cup.rotation": "any"})
     """
@@ -172,7 +172,8 @@ def rollout(
     set_thread_count(wanted)
     try:
         options = {"images": list(frames), "cameras": cameras, "channels": list(channels)}
-        return _make(checked, Path(output), count, options, wanted, device, fresh, on_progress)
+        with claimed(output):
+            return _make(checked, Path(output), count, options, wanted, device, fresh, on_progress)
     finally:
         set_thread_count(before)
 

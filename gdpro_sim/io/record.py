@@ -23,7 +23,7 @@ import gdpro_sim
 from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import RequestError
-from gdpro_sim.files import atomic_write, prepare_folder, remove_stale, sha256_of
+from gdpro_sim.files import atomic_write, claimed, prepare_folder, remove_stale, sha256_of
 from gdpro_sim.io.images import (
     frame_name,
     read_png,
@@ -105,12 +105,17 @@ def record(
     `allow_code` lets the Python files run that the scene names (`motion: {callback: …}`).
 
     A run of the same scene that was interrupted there is continued, unless `fresh`. Raises RequestError (also
-    SceneError, MeshError, AssetError, DeviceError) before anything runs, SolverError or OutputError later;
-    finished frames stay on disk and the next call continues after them.
+    SceneError, MeshError, AssetError, DeviceError) before anything runs, also where another run writes into
+    that folder, SolverError or OutputError later; finished frames stay on disk and the next call continues
+    after them.
     """
     checked = with_code(scene if isinstance(scene, Scene) else load_scene(scene), allow_code)
     device = resolve_device(device)
-    report = on_progress or (lambda phase, done, total: None)
+    with claimed(output):
+        return _record(checked, output, device, fresh, on_progress or (lambda phase, done, total: None))
+
+
+def _record(checked: Scene, output: str | Path, device: str, fresh: bool, report: Progress) -> Recording:
     begin = time.perf_counter()
     seconds: dict[str, float] = {}
     check_supported(checked)
@@ -147,7 +152,7 @@ def record(
     cameras = named_cameras(checked.camera, checked.cameras)
     staging = Staging(cameras, checked.lights, low, high, times, bodies, studio)
     preview = {"low": low.tolist(), "high": high.tolist(), "studio": asdict(staging.studio)}
-    obstacles = Obstacles(simulation.obstacles, low, high, device)
+    obstacles = Obstacles(simulation.obstacles, low, high, device, staging.first)
     scenery = Scenery([bound for _, bound in bodies], obstacles, staging.studio, device)
     rows = _run(simulation, folder, store, staging, scenery, preview, report)
 
