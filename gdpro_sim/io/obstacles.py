@@ -11,10 +11,10 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from gdpro_sim.asset.from_mesh import bind_mesh
+from gdpro_sim.asset.from_mesh import FLATNESS, MIN_BUDGET, OPACITY, bind_mesh
 from gdpro_sim.binding import BoundGaussians
-from gdpro_sim.errors import MeshError
-from gdpro_sim.gaussians import Gaussians
+from gdpro_sim.cameras import Cameras
+from gdpro_sim.gaussians import Gaussians, rgb_to_sh
 from gdpro_sim.meshing.repair import face_areas
 from gdpro_sim.meshing.surface import SurfaceMesh
 from gdpro_sim.simulation.colliders import Collider
@@ -24,20 +24,26 @@ COLOR = (0.60, 0.63, 0.67)
 BUDGET = 12_000
 """Gaussians of each obstacle."""
 
-BASE = 30_000
-"""Of all parts of a base together, which are many and small; shared by their widths."""
+BASE, PART, LEAST = 150_000, 10_000, 300
+"""Of all parts of a base together at most; of one at most and at least."""
 
-LEAST = 600
-"""Of each part at least."""
+FINE = 2.0
+"""Pixels between neighbours of a part's Gaussians, from where the camera first stands."""
 
-SIMPLE = 1000
-"""A part of no more faces is drawn with all of them: decimated, flat ones would turn into needles."""
+ACROSS = 600.0
+"""Pixels that what is shown measures where no camera is given."""
+
+BOX = 12
+"""Faces of a part, up to which its Gaussians lie in rows."""
+
+OVERLAP = 0.75
+"""Standard deviation of a part's Gaussians in its surface, over the spacing of neighbours."""
 
 PLATE = 1.2
 """Half the width of the square that stands for a plane, as a multiple of the size of what is shown."""
 
-ROUND, SMALL = 40, 20
-"""Sides of a circle, and of one that is part of a base."""
+ROUND = 40
+"""Sides of a circle."""
 
 LARGE = 3.0
 """An obstacle this many times larger than what bodies need is not shown whole."""
@@ -47,21 +53,37 @@ class Obstacles:
     """Gaussians and normals of obstacles at any time, on `device`.
 
     low, high: corners of the box in m that is shown; a plane is drawn as a plate of about that size
+    view:      one camera, where it first stands: parts of a base are drawn as finely as it sees them
     """
 
     def __init__(
-        self, colliders: Sequence[Collider], low: np.ndarray, high: np.ndarray, device: str = "cpu"
+        self,
+        colliders: Sequence[Collider],
+        low: np.ndarray,
+        high: np.ndarray,
+        device: str = "cpu",
+        view: Cameras | None = None,
     ) -> None:
         low, high = np.asarray(low, float), np.asarray(high, float)
         shown = [(number, item) for number, item in enumerate(colliders) if item.visible]
         surfaces = [surface_of(item, low, high) for _, item in shown]
-        budgets = _budgets([item for _, item in shown], surfaces)
+        parts = [k for k, (_, item) in enumerate(shown) if item.color is not None]
+        placed = [
+            v @ item.rotation.T + item.position for (_, item), (v, _) in zip(shown, surfaces, strict=True)
+        ]
+        size = float(np.linalg.norm(high - low))
+        shares = _shares([(placed[k], surfaces[k][1]) for k in parts], size, view)
+        budgets = dict(zip(parts, shares, strict=True))
         self._items: list[tuple[int, Collider, Gaussians, torch.Tensor]] = []
-        for (number, collider), (vertices, faces), budget in zip(shown, surfaces, budgets, strict=True):
-            placed = vertices @ collider.rotation.T + collider.position
-            mesh = SurfaceMesh.from_arrays(placed, faces, color=collider.color or COLOR)
-            bound = _bind(mesh, budget).to(device)
-            self._items.append((number, collider, bound.gaussians(), bound.normals()))
+        for k, ((number, item), (_, faces)) in enumerate(zip(shown, surfaces, strict=True)):
+            budget = budgets.get(k, max(BUDGET, 2 * len(faces)))
+            if item.color is None or len(faces) <= BOX:
+                mesh = SurfaceMesh.from_arrays(placed[k], faces, color=item.color or COLOR)
+                bound = bind_mesh(mesh, budget=max(budget, MIN_BUDGET), occlusion=0.0)
+            else:
+                bound = _sampled(placed[k], faces, item.color, budget)
+            bound = bound.to(device)
+            self._items.append((number, item, bound.gaussians(), bound.normals()))
 
     @property
     def counts(self) -> list[tuple[int, int]]:
@@ -91,27 +113,57 @@ class Obstacles:
         return Gaussians.concatenate(parts), torch.cat(facing)
 
 
-def _budgets(colliders: Sequence[Collider], surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[int]:
-    """Gaussians of each obstacle; parts of a base, which have colours, share theirs."""
-    widths = np.array([
-        0.0 if item.color is None else math.sqrt(float(face_areas(*surface).sum()))
-        for item, surface in zip(colliders, surfaces, strict=True)
-    ])  # fmt: skip
-    shares = BASE * widths / max(float(widths.sum()), 1e-30)
-    return [
-        max(BUDGET, 2 * len(faces))
-        if item.color is None
-        else max(LEAST, int(share), 4 * len(faces) if len(faces) <= SIMPLE else 0)
-        for item, (_, faces), share in zip(colliders, surfaces, shares, strict=True)
-    ]
+def _shares(
+    surfaces: Sequence[tuple[np.ndarray, np.ndarray]], size: float, view: Cameras | None
+) -> list[int]:
+    """Gaussians of each part of a base, by what a camera sees of it; size: m, of what is shown."""
+    wanted = []
+    for vertices, faces in surfaces:
+        resolution = ACROSS / size
+        if view is not None:
+            resolution = _resolution(vertices, view)
+        wanted.append(float(face_areas(vertices, faces).sum()) * (resolution / FINE) ** 2)
+    counts = np.clip(wanted, LEAST, PART)
+    return (counts * min(1.0, BASE / max(float(counts.sum()), 1.0))).astype(int).tolist()
 
 
-def _bind(mesh: SurfaceMesh, budget: int) -> BoundGaussians:
-    """As many as asked for, or as its mesh needs that cannot be decimated so far."""
-    try:
-        return bind_mesh(mesh, budget=budget, occlusion=0.0)
-    except MeshError:
-        return bind_mesh(mesh, budget=max(budget, 2 * len(mesh.faces)), occlusion=0.0)
+def _resolution(vertices: np.ndarray, view: Cameras) -> float:
+    """Pixels per metre at which a camera sees a part of vertices [V, 3] m; 0 where it does not."""
+    matrix, k = view.viewmats[0].double().numpy(), view.Ks[0].double().numpy()
+    points = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    points = points[points[:, 2] > 0.0]
+    if not len(points):
+        return 0.0
+    u, v = (k[axis, axis] * points[:, axis] / points[:, 2] + k[axis, 2] for axis in (0, 1))
+    if u.max() < 0.0 or u.min() > view.width or v.max() < 0.0 or v.min() > view.height:
+        return 0.0
+    seen = (u > 0.0) & (u < view.width) & (v > 0.0) & (v < view.height)
+    return float(k[0, 0] / np.median(points[seen if seen.any() else slice(None), 2]))
+
+
+def _sampled(
+    vertices: np.ndarray, faces: np.ndarray, color: tuple[float, float, float], budget: int
+) -> BoundGaussians:
+    """About `budget` round Gaussians spread evenly: triangles of machines are long slivers, and Gaussians of
+    their shape would reach past every edge."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    points, ids = trimesh.sample.sample_surface(mesh, 3 * budget, seed=0)
+    points, kept = trimesh.points.remove_close(points, math.sqrt(float(mesh.area) / (3.0 * budget)))
+    ids = ids[kept]
+    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[ids], points)
+    count = len(points)
+    spread = OVERLAP * math.sqrt(float(mesh.area) / count)
+    scales = np.log([FLATNESS * spread, spread, spread])
+    return BoundGaussians(
+        vertices=torch.tensor(vertices, dtype=torch.float32),
+        faces=torch.tensor(faces, dtype=torch.int32),
+        face_ids=torch.tensor(ids, dtype=torch.int32),
+        barycentrics=torch.tensor(weights, dtype=torch.float32),
+        rotations=torch.tensor([[1.0, 0.0]]).repeat(count, 1),
+        log_scales=torch.tensor(scales, dtype=torch.float32).repeat(count, 1),
+        opacity_logits=torch.full((count,), math.log(OPACITY / (1.0 - OPACITY))),
+        sh=rgb_to_sh(torch.tensor(color, dtype=torch.float32)).repeat(count, 1, 1),
+    )
 
 
 def _moved(
@@ -147,10 +199,10 @@ def with_obstacles(
     return np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
 
 
-def _outline(radius: float, half: float, sides: int) -> list[tuple[float, float]]:
+def _outline(radius: float, half: float) -> list[tuple[float, float]]:
     """(r, z) m around a cylinder. Triangles are about as long as wide, along it three times as long: the
     Gaussians of long ones would reach past its edges, and whole fans at its ends are needles."""
-    edge = 2.0 * math.pi * radius / sides
+    edge = 2.0 * math.pi * radius / ROUND
     rings = [radius * k for k in np.linspace(0.0, 1.0, max(round(radius / edge), 2) + 1)]
     inner = max(half - edge, 0.0)
     steps = int(np.clip(round(2.0 * inner / (3.0 * edge)), 1, 16))
@@ -170,16 +222,16 @@ def surface_of(collider: Collider, low: np.ndarray, high: np.ndarray) -> tuple[n
         plate = trimesh.creation.box((2.0 * half, 2.0 * half, thick))
         plate.apply_translation((middle[0], middle[1], -0.5 * thick))
         return np.asarray(plate.vertices), np.asarray(plate.faces, np.int32)
-    size, sides = collider.size, ROUND if collider.color is None else SMALL
+    size = collider.size
     if collider.kind == "box":
         shape = trimesh.creation.box(2.0 * np.asarray(size))
     elif collider.kind == "sphere":
-        shape = trimesh.creation.icosphere(subdivisions=round(math.log2(sides / 5.0)), radius=size[0])
+        shape = trimesh.creation.icosphere(subdivisions=3, radius=size[0])
     elif collider.kind == "capsule":
-        shape = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[sides, sides])
+        shape = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[ROUND, ROUND])
         shape.apply_translation((0.0, 0.0, -float(shape.bounds.mean(axis=0)[2])))
     else:
-        shape = trimesh.creation.revolve(_outline(size[0], size[1], sides), sections=sides)
+        shape = trimesh.creation.revolve(_outline(size[0], size[1]), sections=ROUND)
     return np.asarray(shape.vertices), np.asarray(shape.faces, np.int32)
 
 

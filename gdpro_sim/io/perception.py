@@ -240,7 +240,9 @@ class Photographer:
         return float(np.linalg.norm(corners[:, None] - np.array(eyes), axis=-1).max())
 
     def _obstacles_of(self, simulation: Simulation) -> Obstacles:
-        return Obstacles(simulation.obstacles, self.low, self.high, self._device)
+        return Obstacles(
+            simulation.obstacles, self.low, self.high, self._device, self._first(self.scene.camera)
+        )
 
 
 __all__ = ["CHANNELS", "Photographer", "Shots", "depth_and_labels", "depth_units"]

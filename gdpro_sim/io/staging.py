@@ -107,6 +107,12 @@ class Staging:
         assert self.studio.azimuth is not None
         return Shot(views, focus, self.lights_at(time, self.studio.azimuth), not self._own_lights)
 
+    @property
+    def first(self) -> Cameras | None:
+        """Where the main camera first stands; None for one that goes along with a body."""
+        name, camera = next(iter(self._cameras.items()))
+        return None if camera.follow is not None else self._paths[name].at(0.0)
+
     def lights_at(self, time: float, azimuth: float) -> tuple[LightState, ...]:
         """The lights at a time in s; azimuth: degrees, of the camera that some of them stand beside."""
         return tuple(lamp.at(time, azimuth) for lamp in self._lamps)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gdpro_sim.asset import Asset, kind
+from gdpro_sim.cameras import Cameras
 from gdpro_sim.device import resolve_device, serial_torch
 from gdpro_sim.errors import RequestError, SceneError
 from gdpro_sim.files import atomic_write, prepare_folder, remove_stale
@@ -221,7 +222,9 @@ def _simulation_frames(reader: SimulationReader, look: Look, device: str, passes
         bodies,
         _with_render(studio, scene),
     )
-    scenery = Scenery([bound for _, bound in bodies], _obstacles(reader, device), staging.studio, device)
+    scenery = Scenery(
+        [bound for _, bound in bodies], _obstacles(reader, device, staging.first), staging.studio, device
+    )
 
     def pictures() -> Iterator[Drawn]:
         for frame in reader:
@@ -235,7 +238,7 @@ def _with_render(studio: Studio, scene: Scene) -> Studio:
     return replace(studio, **scene.render.model_dump())
 
 
-def _obstacles(reader: SimulationReader, device: str) -> Obstacles:
+def _obstacles(reader: SimulationReader, device: str, view: Cameras | None) -> Obstacles:
     """What the bodies of a recorded scene meet, and parts of a base."""
     scene, preview = reader.metadata.get("scene"), reader.metadata.get("preview")
     if scene is None or preview is None or not (scene.get("colliders") or reader.links):
@@ -252,9 +255,8 @@ def _obstacles(reader: SimulationReader, device: str) -> Obstacles:
             colliders.append(replace(seen, motion=motion))
         else:
             colliders.append(compile_collider(options))
-    return Obstacles(
-        [*colliders, *reader.links], np.asarray(preview["low"]), np.asarray(preview["high"]), device
-    )
+    box = np.asarray(preview["low"]), np.asarray(preview["high"])
+    return Obstacles([*colliders, *reader.links], *box, device, view)
 
 
 def gaussians_of(file: str | Path, frame: int = 0) -> Gaussians:

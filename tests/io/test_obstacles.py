@@ -13,9 +13,10 @@ from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from gdpro_sim.asset import import_mesh
+from gdpro_sim.cameras import Cameras
 from gdpro_sim.gaussians import Gaussians, rotation_matrices
 from gdpro_sim.io.images import read_png
-from gdpro_sim.io.obstacles import BASE, Obstacles, with_obstacles
+from gdpro_sim.io.obstacles import BASE, FINE, LEAST, Obstacles, with_obstacles
 from gdpro_sim.io.record import record
 from gdpro_sim.io.views import render_file
 from gdpro_sim.simulation.colliders import Collider, compile_collider
@@ -133,10 +134,18 @@ def test_what_moves_is_drawn_turned_and_shifted() -> None:
     close(covariances(after), turn @ covariances(before) @ turn.T, atol=1e-9)
 
 
-def test_parts_of_a_base_share_their_gaussians() -> None:
-    small, large = (
-        Collider("part", "box", size=(half, half, half), color=(0.5, 0.5, 0.5)) for half in (0.02, 0.1)
-    )
-    counts = [count for _, count in Obstacles([small, large] * 20, LOW, HIGH).counts]
-    assert counts[0] < counts[1]
-    assert 0.7 * BASE < sum(counts) < 1.3 * BASE
+def test_parts_of_a_base_are_drawn_as_finely_as_they_are_seen() -> None:
+    def part(half: float, x: float) -> Collider:
+        place = np.array([x, 0.0, 0.0])
+        return Collider("part", "box", size=(half, half, half), position=place, color=(0.5, 0.5, 0.5))
+
+    view = Cameras.look_at([3.0, 0.0, 0.0], [0.0, 0.0, 0.0], vertical_fov=0.7, width=200, height=200)
+    parts = [part(0.1, 0.0), part(0.1, 1.5), part(0.05, 0.0), part(0.1, 6.0)]
+    shown = Obstacles(parts, LOW, HIGH, view=view)
+    far, near, small, behind = (count for _, count in shown.counts)
+    exact = 6 * 0.2**2 * (view.Ks[0, 0, 0].item() / 1.5 / FINE) ** 2
+    assert near == pytest.approx(exact, rel=0.3)
+    assert 0.2 < far / near < 0.35
+    assert far > small and behind <= LEAST
+    many = Obstacles([part(0.2, 1.5)] * 40, LOW, HIGH, view=view).counts
+    assert sum(count for _, count in many) <= BASE
