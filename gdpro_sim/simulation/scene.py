@@ -7,6 +7,7 @@ import importlib.resources
 import importlib.util
 import logging
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
@@ -303,7 +304,9 @@ def load_scene(scene: str | Path, *, seed: int | None = None) -> Scene:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; `gdpro scenes` lists the shipped scenes") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: byte {error.start} is not UTF-8; save it as UTF-8 text") from None
+    except OSError as error:
         raise SceneError(f"{path}: cannot be read as text: {error}") from None
     return _parse(text, str(path), path.resolve().parent, seed)
 
@@ -368,6 +371,18 @@ def checked(kind: type[Described], data: dict[str, Any], source: str) -> Describ
         raise SceneError("\n".join(dict.fromkeys(lines))) from None
 
 
+_PLAIN = (
+    (r", unable to parse string as .*", ""),
+    (r"a valid (tuple|list)", "a list"),
+    (r"a valid dictionary( or .*)?", "a mapping of keys to values"),
+    (r"a valid number", "a number"),
+    (r"a valid integer", "a whole number"),
+    (r"a valid string", "text"),
+    (r"a valid boolean", "true or false"),
+)
+"""What pydantic says, and what it means to somebody who writes YAML."""
+
+
 def _explain(item: Any, source: str, root: type[BaseModel]) -> str:
     """One line for one pydantic error: file, path of the key, what was expected, what was given."""
     location = item["loc"]
@@ -389,6 +404,8 @@ def _explain(item: Any, source: str, root: type[BaseModel]) -> str:
         return f"{source}: {place}: must hold at least one item"
     message = str(item["msg"])
     message = message.removeprefix("Value error, ").replace("Input should be", "must be")
+    for pattern, plain in _PLAIN:
+        message = re.sub(pattern, plain, message)
     message = message[0].lower() + message[1:]
     said = "got" in message or (isinstance(value, str) and repr(value) in message)
     shown = "" if said or isinstance(value, dict | list) else f", got {value!r}"

@@ -12,7 +12,7 @@ from gdpro_sim.simulation.animation_options import BodyAnimation
 from gdpro_sim.simulation.copies import Copied, Copies
 from gdpro_sim.simulation.forces import ConstantForce, Pin, Push, SurfacePressure
 from gdpro_sim.simulation.mujoco_options import MujocoBody
-from gdpro_sim.simulation.options import Options, Vector, several
+from gdpro_sim.simulation.options import Options, Vector, color_of, several
 from gdpro_sim.simulation.regions import Region
 
 
@@ -94,6 +94,13 @@ class SceneBody(Options):
     )
 
     copied: Copied | None = Field(default=None, description="set by `copies`")
+
+    @field_validator("color")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        if value is not None:
+            color_of(value)
+        return value
 
     @field_validator("parts", "pins", "forces", "impulses", "pressures", mode="before")
     @classmethod

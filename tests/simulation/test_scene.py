@@ -69,6 +69,11 @@ def test_defaults_and_relative_paths(tmp_path: Path) -> None:
             r"gravty: unknown key \(did you mean `gravity`\?\); allowed: .*ground",
         ),
         (MINIMAL + "    colour: red", r"bodies\[0\].colour: unknown key \(did you mean `color`\?\)"),
+        (MINIMAL + "    color: reddish", r"bodies\[0\].color: colour 'reddish' is unknown; write #rrggbb"),
+        (MINIMAL + "    size: 20cm", r"bodies\[0\].size: must be a number, got '20cm'"),
+        (MINIMAL + "gravity: -9.81", "gravity: must be a list, got -9.81"),
+        (MINIMAL + "camera: 3", "camera: must be a mapping of keys to values, got 3"),
+        (MINIMAL + "fps: 29.97", "fps: must be a whole number, got a number with"),
         (MINIMAL + "    material: jely", "unknown material 'jely'.*did you mean 'jelly'.*steel"),
         (
             MINIMAL + "    material: {preset: jelly, young: -3}",
@@ -168,6 +173,13 @@ def test_wrong_scenes_are_refused(tmp_path: Path, text: str, expected: str) -> N
     assert caught.value.exit_code == 2
     assert str(tmp_path / "scene.yaml") in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_text_in_another_encoding_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_bytes(MINIMAL.encode() + "description: Café".encode("latin-1"))
+    with pytest.raises(SceneError, match=r"byte \d+ is not UTF-8; save it as UTF-8 text"):
+        load_scene(path)
 
 
 def test_yaml_and_python_say_the_same(tmp_path: Path) -> None:
