@@ -214,7 +214,7 @@ def test_callbacks_tell_actuators(tmp_path: Path) -> None:
     ("told", "message"),
     [
         (lambda t, d: {"trun": 1.0}, "no actuator 'trun' .did you mean 'turn'"),
-        (lambda t, d: {"turn": float("nan")}, "'turn' is told nan, which is no finite number"),
+        (lambda t, d: {"turn": np.float64("nan")}, "'turn' is told nan, which is no finite number"),
         (lambda t, d: [1.0, 2.0], "array of 1 numbers"),
         (lambda t, d: "left", "array of 1 numbers"),
         (lambda t, d: 1 / 0, "raised ZeroDivisionError: .*test_mujoco_forces.py, line"),

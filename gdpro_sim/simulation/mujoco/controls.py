@@ -54,7 +54,8 @@ def _value(where: str, name: str, value: Any) -> float:
     except (TypeError, ValueError):
         number = np.nan
     if not np.isfinite(number):
-        raise SolverError(f"{where}: actuator {name!r} is told {value!r}, which is no finite number")
+        told = value.item() if isinstance(value, np.generic) else value
+        raise SolverError(f"{where}: actuator {name!r} is told {told!r}, which is no finite number")
     return number
 
 
