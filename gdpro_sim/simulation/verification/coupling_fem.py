@@ -221,7 +221,7 @@ def driven() -> Iterator[Check]:
 
 
 @problem(
-    "same bytes",
+    "same-bytes",
     title="An impact gives the same bytes on 1 and 2 threads, and after a restart",
     source="sums run in an order of the problem's own (DESIGN.md)",
 )

@@ -32,7 +32,7 @@ JELLY = Material(young=2e4, poisson=0.3, density=1000.0)
 
 
 @problem(
-    "head-on, particles",
+    "head-on-particles",
     title="A ball flies at a block of jelly particles in free space: a light, an equal and a heavy one",
     source="momentum is constant, energy never rises",
     slow=True,
@@ -62,7 +62,7 @@ def head_on() -> Iterator[Check]:
 
 
 @problem(
-    "one solver",
+    "one-solver",
     title="A ball among particles, moved by MuJoCo or by MPM itself",
     source="MPM's own free rigid obstacles, which it solves with the grid",
 )
@@ -87,7 +87,7 @@ def one_solver() -> Iterator[Check]:
 
 
 @problem(
-    "rest on sand",
+    "rest-on-sand",
     title="A ball of 1.8 kg comes to rest on sand in a box",
     source="the sand bears m g",
     slow=True,
