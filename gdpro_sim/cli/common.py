@@ -79,7 +79,8 @@ def progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=quiet, transient=True) as bars:
+    shown = console.is_terminal and not quiet
+    with Progress(*columns, console=console, disable=not shown, transient=True) as bars:
         tasks: dict[str, Any] = {}
 
         def report(phase: str, done: int, total: int) -> None:
@@ -100,11 +101,19 @@ def table(title: str, rows: list[tuple[str, str]]) -> None:
     Console().print(table)
 
 
+def _without_none(value: Any) -> Any:
+    """Plain data without the keys that hold nothing."""
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return value
+
+
 def show(data: dict[str, Any], title: str, as_json: bool, quiet: bool) -> None:
     if as_json:
         print(json.dumps(data))
     elif not quiet:
-        rows = ((k.replace("_", " "), v if isinstance(v, str) else json.dumps(v)) for k, v in data.items())
+        given = {key: _without_none(value) for key, value in data.items()}
+        rows = ((k.replace("_", " "), v if isinstance(v, str) else json.dumps(v)) for k, v in given.items())
         table(title, list(rows))
 
 
