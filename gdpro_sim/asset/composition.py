@@ -308,8 +308,9 @@ def _tell_apart(asset: Asset, names: Sequence[str], counts: Sequence[int]) -> No
     apart = [name for name, other in zip(names, held, strict=True) if not reached & other]
     if apart:
         log.warning(
-            "%s: %s not touch the rest and will fall off in a simulation; move parts into each other to glue "
-            "them", asset.name, f"part {apart[0]!r} does" if len(apart) == 1 else f"parts {apart} do",
+            "%s: %s not touch the rest and will come off in a simulation, through the rest unless the solver "
+            "has `self_contact`; move parts into each other to glue them", asset.name,
+            f"part {apart[0]!r} does" if len(apart) == 1 else f"parts {apart} do",
         )  # fmt: skip
 
 

@@ -179,8 +179,9 @@ def _follower(where: str, asset: Asset, motion: Motion, tolerance: float) -> Sur
         raise SceneError(
             f"{where}: {int(far.sum()):,} of {len(points):,} vertices lie more than {tolerance * size:.3g} m "
             f"off the mesh of {motion.path.name}, up to {best.distance.max():.3g} m. The asset reaches from "
-            f"{_extent(points)} m, the mesh from {_extent(motion.rest)} m: give the asset made of this "
-            "mesh, a fitting `scale` or `up`, or a larger `tolerance`"
+            f"{_extent(points)} m, the mesh from {_extent(motion.rest)} m: give the motion's own file as the "
+            "asset (a skin stands where its joints are, not its node), one made of this mesh, a fitting "
+            "`scale` or `up`, or a larger `tolerance`"
         )
     return best.follower
 
