@@ -361,6 +361,13 @@ def _three(values: np.ndarray) -> tuple[float, float, float]:
 # ---- checks ----
 
 
+STUCK = {
+    "fixed": ("velocity", "angular_velocity"), "hinge": ("velocity",), "ball": ("velocity",),
+    "slide": ("angular_velocity",),
+}  # fmt: skip
+"""What bodies on a joint cannot start with."""
+
+
 def check_base_file(scene: Scene) -> None:
     """Raise SceneError where the file of a base does not exist."""
     options = scene.mujoco_options
@@ -376,6 +383,12 @@ def check_supported(scene: Scene) -> None:
             if getattr(body, key):
                 raise SceneError(
                     f"{scene.name}: bodies[{body.name}].{key}: belongs to MPM (`solver: {{kind: mpm}}`)"
+                )
+        joint = "free" if body.mujoco is None else body.mujoco.joint
+        for key in STUCK.get(joint, ()):
+            if any(getattr(body, key)):
+                raise SceneError(
+                    f"{scene.name}: bodies[{body.name}].{key}: the joint {joint!r} does not let it; leave it out"
                 )
         for k, pin in enumerate(body.pins):
             if pin.release is not None or pin.start > 0.0:

@@ -152,6 +152,10 @@ class MujocoBody(Options):
     def _ordered(cls, value: Any) -> Any:
         if value is not None and value[1] <= value[0]:
             raise ValueError(f"the upper limit must lie above the lower {value[0]:g}, got {value[1]:g}")
+        if value is not None and not value[0] <= 0.0 <= value[1]:
+            raise ValueError(
+                f"a body starts at 0, which must lie within its limits, got {value[0]:g} to {value[1]:g}"
+            )
         return value
 
     @model_validator(mode="after")

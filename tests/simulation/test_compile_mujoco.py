@@ -153,6 +153,8 @@ def test_pieces_are_kept_in_the_file(ball: Asset, tmp_path: Path) -> None:
         ({"mujoco": {"form": "full", "joint": "hinge"}}, {}, "joint.* belongs to a rigid body"),
         ({"mujoco": {"joint": "free", "axis": [0, 0, 1]}}, {}, "axis.* belongs to a joint hinge or slide"),
         ({"mujoco": {"joint": "hinge", "limits": [5, 5]}}, {}, "upper limit must lie above"),
+        ({"mujoco": {"joint": "slide", "axis": [0, 0, 1], "limits": [1, 2]}}, {}, "starts at 0, .* 1 to 2"),
+        ({"mujoco": {"joint": "fixed"}, "velocity": [1, 0, 0]}, {}, "velocity: the joint 'fixed' does not"),
         ({"mujoco": {"form": "rigid"}}, {"solver": {"kind": "fem"}}, "mujoco: belongs to"),
         ({"mujoco": {"joint": "hinge"}}, {}, "a hinge needs an `axis`"),
         ({"mujoco": {"form": "soft"}}, {}, "must be 'auto', 'rigid', 'full', 'trilinear' or 'quadratic'"),
@@ -215,3 +217,15 @@ def test_plain_mujoco_reads_the_folder(ball: Asset, tmp_path: Path, form: str) -
         found = json.loads(plain.stdout)
         assert found["mass"] == pytest.approx(summary["mass_kg"], rel=1e-5)
         assert found["warnings"] == 0
+
+
+def test_the_folder_of_a_coupled_scene_has_its_base(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "bodies: {asset: package:warp/examples/assets/sphere.usd, size: 0.1, position: [0.1, 0, 0.3],\n"
+        "  material: wood, mujoco: {shape: sphere}, budget: 500}\n"
+        "solver: {kind: coupled, mujoco: {base: package:gdpro_sim.scenes/see_saw.xml}}\n"
+    )
+    run = CliRunner().invoke(app, ["mjcf", str(scene), "-o", str(tmp_path / "model"), "--json"])
+    assert run.exit_code == 0, run.output
+    assert json.loads(run.stdout)["degrees_of_freedom"] == 1 + 6  # the plate's hinge, and a free ball
