@@ -103,7 +103,7 @@ def carry_patches(
     weights: wp.array[float],
     tolerance: float,
     stretch: float,
-    anisotropy: float,
+    anisotropy: wp.array[float],
     # Out:
     surface_out: wp.array[wp.vec3],
 ):
@@ -130,7 +130,7 @@ def carry_patches(
             total += w
     d = d / total
     # A mean of rotations is shorter than they are: bounds hold anew.
-    A = bounded(A / total + IDENTITY, stretch, anisotropy) - IDENTITY
+    A = bounded(A / total + IDENTITY, stretch, anisotropy[i]) - IDENTITY
     for v in range(vertex_offsets[i], vertex_offsets[i + 1]):
         X = rest_surface[v]
         surface_out[v] = X + (d + A * (X - c))

@@ -281,8 +281,8 @@ def mesh_collider(vertices: np.ndarray, faces: np.ndarray, *, name: str = "mesh"
     )
 
 
-def mesh_thickness(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """How far the other side is straight behind a face, m: the twentieth part of the faces has less."""
+def mesh_thickness(vertices: np.ndarray, faces: np.ndarray, share: float = 0.05) -> float:
+    """How far the other side is straight behind a face, m; a share of the faces has less."""
     normals = face_normals(vertices, faces)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     centres = vertices[faces].mean(axis=1)
@@ -291,7 +291,7 @@ def mesh_thickness(vertices: np.ndarray, faces: np.ndarray) -> float:
     hit, weights = SurfaceIndex(vertices, faces).first_hit(origins, -normals)
     ends = np.einsum("fc,fci->fi", weights.astype(np.float64), vertices[faces[np.maximum(hit, 0)]])
     depth = np.linalg.norm(ends - centres, axis=1)[hit >= 0]
-    return float(np.quantile(depth, 0.05)) if len(depth) else size
+    return float(np.quantile(depth, share)) if len(depth) else size
 
 
 def _terrain(heights: np.ndarray, size: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

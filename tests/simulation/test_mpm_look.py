@@ -21,7 +21,7 @@ from gdpro_sim.io.preview import Renderer, Studio, frame_camera
 from gdpro_sim.kernels.mpm_look import bound_deformations
 from gdpro_sim.meshing.fill import Filling, fill_mesh
 from gdpro_sim.meshing.surface import SurfaceMesh
-from gdpro_sim.simulation.mpm.look import Look, Unwelded, unweld
+from gdpro_sim.simulation.mpm.look import NEEDLE, Look, Unwelded, anisotropies, unweld
 from tests.reference.look import blend, bounded
 
 STRETCH, ANISOTROPY = 4.0, 2.5
@@ -165,6 +165,25 @@ def test_a_torn_bar_has_no_needles_and_nothing_spans_the_gap(
     assert (np.abs(whole[bound.faces.numpy()] - whole[np.roll(bound.faces.numpy(), 1, axis=1)])).max() > 0.3
     _, f = pulled(filling, gap)
     assert np.linalg.cond(f).max() > 50.0
+
+
+def test_what_is_long_at_rest_is_not_pulled_to_a_needle(
+    torn: tuple[BoundGaussians, Filling, Unwelded],
+) -> None:
+    """However long the mesh's Gaussians are: longer than `NEEDLE` only as they were."""
+    _, filling, parts = torn
+    long = parts.gaussians.log_scales.clone()
+    long[::7, 1] += 1.0
+    cut = replace(parts.gaussians, log_scales=long)
+    most = anisotropies(cut, parts.patches)
+    assert most.min() == 1.0 and most.max() == ANISOTROPY
+    look = Look(cut.vertices.numpy(), filling.points, patches=parts.patches, anisotropy=most)
+    now = cut.gaussians(torch.from_numpy(look.surface(*pulled(filling, 0.5))))
+    before = elongation(cut.gaussians())
+    assert (elongation(now) / np.maximum(before, NEEDLE)).max() <= 1.02
+    assert before.max() > NEEDLE and (elongation(now) / before).max() > 1.5
+    at_rest = look.surface(filling.points, identity(len(filling)))
+    assert at_rest.tobytes() == cut.vertices.numpy().tobytes()
 
 
 def test_a_tear_opens_without_a_jump(torn: tuple[BoundGaussians, Filling, Unwelded]) -> None:

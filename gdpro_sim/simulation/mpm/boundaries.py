@@ -52,6 +52,9 @@ AROUND = 2.1
 MARGIN = 1.0
 """Cells that a moving obstacle may go before the blocks near it are looked for again."""
 
+THIN = 0.25
+"""Share of a mesh's faces that may have too little behind them without a warning: ears, fins."""
+
 COUPLINGS = 8
 """Most Newton iterations for the velocity of a rigid body among matter that slides, sticks or leaves."""
 
@@ -438,14 +441,14 @@ class Obstacles:
             if item.kind == "plane" or item.heights is not None:  # as deep as need be
                 continue
             if item.vertices is not None and item.faces is not None:
-                thickness = mesh_thickness(item.vertices, item.faces)
+                thickness = mesh_thickness(item.vertices, item.faces, THIN)
             if thickness < 2.0 * spacing:
                 log.warning(
-                    "collider %r %s %.3g m thick, less than two cells of %.3g m: matter may pass through; "
+                    "collider %r is %.3g m thick%s, less than two cells of %.3g m: matter may pass through; "
                     "make it thicker, or cells smaller",
                     item.name,
-                    "is" if item.vertices is None else "has parts",
                     thickness,
+                    "" if item.vertices is None else " or less in a quarter of its surface",
                     spacing,
                 )
 

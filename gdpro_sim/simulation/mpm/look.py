@@ -38,6 +38,12 @@ TOLERANCE = 0.75
 """How far apart two particles may take a patch before it leaves the further one, in distances between
 neighbours."""
 
+ANISOTROPY = 2.5
+"""Longest over shortest stretch of a patch, at most."""
+
+NEEDLE = 4.0
+"""Longest over middle axis to which a patch may pull its Gaussians; those that are longer at rest stay so."""
+
 PATCH_EDGE = 1.5
 """Longest edge of a triangle in a patch, in spacings."""
 
@@ -64,7 +70,8 @@ class Look:
     positions:  [n, 3] float32 m, rest
     patches:    [V] int32 ascending, the patch of each vertex (`unweld`), or None: the surface stays whole
     stretch:    patches: they grow to this much of their size along an axis at most, and shrink to its inverse
-    anisotropy: patches: longest over shortest stretch at most; one pulled longer than it is wide is cut short
+    anisotropy: patches: longest over shortest stretch at most, of all or of each [P], see `anisotropies`; one
+                pulled longer than it is wide is cut short
     device:     where to compute; the result is the same for any number of threads
 
     Bit-exact at rest. Exact for affine motion, in patches within the bounds, whole up to a stretch of 8.
@@ -77,17 +84,18 @@ class Look:
         *,
         patches: np.ndarray | None = None,
         stretch: float = 3.0,
-        anisotropy: float = 2.5,
+        anisotropy: float | np.ndarray = ANISOTROPY,
         device: str = "cpu",
     ) -> None:
         if not len(positions):
             raise SolverError("a surface cannot be carried by no particle")
-        if not (stretch >= 1.0 and anisotropy >= 1.0):
-            raise SolverError(f"stretch and anisotropy must be >= 1, got {stretch} and {anisotropy}")
+        most = float(np.max(anisotropy))
+        if not (stretch >= 1.0 and np.min(anisotropy) >= 1.0):
+            raise SolverError(f"stretch and anisotropy must be >= 1, got {stretch} and {np.min(anisotropy)}")
         self.device = device
         self._launch = Launches(device)
         self._count = len(positions)
-        self._bounds = (float(stretch), float(anisotropy))
+        self._bounds = (float(stretch), most)
         if patches is None:
             self._bounds = (WHOLE_STRETCH, WHOLE_STRETCH**2)
         surface = np.ascontiguousarray(surface, np.float32)
@@ -103,7 +111,9 @@ class Look:
             near, weights = _blend(tree, surface.astype(np.float64))
             self._near, self._weights = self._array(near, wp.int32), self._array(weights, wp.float32)
         else:
-            self._attach(tree, surface.astype(np.float64), np.asarray(patches, np.int64))
+            count = self._attach(tree, surface.astype(np.float64), np.asarray(patches, np.int64))
+            of_each = np.broadcast_to(np.asarray(anisotropy, np.float32), count)
+            self._anisotropy = self._array(of_each, wp.float32)
 
     def surface(self, positions: np.ndarray, deformations: np.ndarray) -> np.ndarray:
         """The surface [V, 3] float32 m, with particles at `positions` [n, 3] and total deformation gradients
@@ -123,7 +133,7 @@ class Look:
             inputs = [*fixed, self._near, self._weights]
             self._launch(carry_vertices, len(self._out), inputs, [self._out])
         else:
-            inputs = [*fixed, *self._patches, self._tolerance, *self._bounds]
+            inputs = [*fixed, *self._patches, self._tolerance, self._bounds[0], self._anisotropy]
             self._launch(carry_patches, len(self._patches[1]), inputs, [self._out])
         return self._out.numpy().copy()
 
@@ -131,8 +141,8 @@ class Look:
         kind = np.int32 if dtype is wp.int32 else np.float32
         return wp.array(np.ascontiguousarray(values, kind), dtype=dtype, device=self.device)
 
-    def _attach(self, tree: cKDTree, surface: np.ndarray, patches: np.ndarray) -> None:
-        """Centre, vertices and particles of each patch."""
+    def _attach(self, tree: cKDTree, surface: np.ndarray, patches: np.ndarray) -> int:
+        """Centre, vertices and particles of each patch; how many patches there are."""
         if len(patches) != len(surface) or (np.diff(patches) < 0).any():
             raise SolverError(f"patches must be ascending numbers of {len(surface)} vertices")
         starts = np.concatenate([[0], np.flatnonzero(np.diff(patches)) + 1, [len(patches)]])
@@ -157,6 +167,21 @@ class Look:
         count = min(self._count, 20_000)
         own = tree.query(tree.data[:: max(self._count // count, 1)], k=2)[0][:, -1]
         self._tolerance = TOLERANCE * float(np.median(own)) if self._count > 1 else 1.0
+        return len(centres)
+
+
+def anisotropies(bound: BoundGaussians, patches: np.ndarray) -> np.ndarray:
+    """[P] float32, how much longer than wide a patch may be pulled before one of its Gaussians is a needle.
+
+    patches: [V] int32 ascending, the patch of each vertex
+    """
+    scales = np.sort(bound.log_scales.detach().cpu().exp().numpy(), axis=1)
+    length = scales[:, 2] / np.maximum(scales[:, 1], 1e-30)
+    patch = np.unique(patches, return_inverse=True)[1]
+    longest = np.ones(int(patch[-1]) + 1)
+    corner = bound.faces.cpu().numpy()[bound.face_ids.cpu().numpy(), 0]
+    np.maximum.at(longest, patch[corner], length)
+    return np.clip(NEEDLE / longest, 1.0, ANISOTROPY).astype(np.float32)
 
 
 def _blend(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -377,4 +402,4 @@ def _facing(normals: np.ndarray) -> np.ndarray:
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-__all__ = ["Look", "Unwelded", "colors_around", "unweld"]
+__all__ = ["Look", "Unwelded", "anisotropies", "colors_around", "unweld"]

@@ -267,7 +267,7 @@ class SolverMPM:
     def surface_positions(self, body: int) -> np.ndarray:
         """Deformed surface vertices of body number `body`, [V, 3] float32 m, world."""
         from gdpro_sim.simulation.mpm.fluid_look import FluidLook  # both compile kernels
-        from gdpro_sim.simulation.mpm.look import Look
+        from gdpro_sim.simulation.mpm.look import Look, anisotropies
 
         item = self.model.bodies[body]
         begin, end = item.particle_range
@@ -275,8 +275,17 @@ class SolverMPM:
         look = self._looks.get(body)
         if look is None and item.spacing is not None:
             look = FluidLook(end - begin, item.spacing, device=self.model.device)
+        elif look is None and item.patches is not None:
+            most = anisotropies(item.gaussians, item.patches)
+            look = Look(
+                item.surface,
+                self._rest[begin:end],
+                patches=item.patches,
+                anisotropy=most,
+                device=self.model.device,
+            )
         elif look is None:
-            look = Look(item.surface, self._rest[begin:end], patches=item.patches, device=self.model.device)
+            look = Look(item.surface, self._rest[begin:end], device=self.model.device)
         self._looks[body] = look
         if isinstance(look, FluidLook):
             return look.surface(positions)
