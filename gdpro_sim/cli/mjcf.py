@@ -25,11 +25,13 @@ def mjcf(
 ) -> None:
     """Write a folder that plain MuJoCo loads: model.xml, its files, and the same compiled, model.mjb.
 
-    A scene for another solver is taken as one for MuJoCo where MuJoCo has all it asks for.
+    A scene for another solver is taken as one for MuJoCo where MuJoCo has all it asks for, a coupled one with
+    its `solver.mujoco`.
     """
     setup(quiet, debug)
     check_choice("--form", form, FORMS)
-    from gdpro_sim.simulation.compile import compile_scene, load_assets
+    from gdpro_sim.files import prepare_folder
+    from gdpro_sim.simulation.compile import check_files, check_supported, compile_scene, load_assets
     from gdpro_sim.simulation.mujoco.export import export_mjcf
     from gdpro_sim.simulation.mujoco.solver import SolverMuJoCo
     from gdpro_sim.simulation.mujoco_options import MujocoBody, MujocoOptions
@@ -44,8 +46,10 @@ def mjcf(
         # What falls in a preview is made softer than the asset is; a model for others should not be.
         bodies = [body.model_copy(update={"material": None}) for body in scene.bodies]
         scene = scene.model_copy(update={"bodies": tuple(bodies)})
-    if not isinstance(scene.solver, MujocoOptions):
-        scene = scene.model_copy(update={"solver": MujocoOptions()})
+    scene = scene.model_copy(update={"solver": scene.mujoco_options or MujocoOptions()})
+    check_supported(scene)
+    check_files(scene)
+    prepare_folder(output, "model.xml")
 
     with progress(quiet or json_output) as report:
         report("prepare", 0, 0)
