@@ -388,7 +388,8 @@ def check_supported(scene: Scene) -> None:
         for key in STUCK.get(joint, ()):
             if any(getattr(body, key)):
                 raise SceneError(
-                    f"{scene.name}: bodies[{body.name}].{key}: the joint {joint!r} does not let it; leave it out"
+                    f"{scene.name}: bodies[{body.name}].{key}: the joint {joint!r} does not let it; leave it "
+                    "out"
                 )
         for k, pin in enumerate(body.pins):
             if pin.release is not None or pin.start > 0.0:

@@ -11,7 +11,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.optimize import brentq
 
 STEPS = 0.15
 """k is so that the contact's angular frequency times the time step is this: twenty steps an impact."""
@@ -35,26 +34,31 @@ FLEX_REFERENCE = (0.01, 1.0)
 """`solref` of what touches a flex: time constant in s, and damping ratio."""
 
 
-def restitution_of(damping: float) -> float:
-    """Speed after an impact over speed before, of a damping ratio b / (2 sqrt(k)), in steps of `STEPS`.
+def restitution_of(damping: float | np.ndarray) -> np.ndarray:
+    """Speed after an impact over speed before, of damping ratios b / (2 sqrt(k)), in steps of `STEPS`.
 
     The mean over where in a step the impact begins. In the limit of short steps it is that of a spring and
     dashpot that never pull (Schwager & Poeschel 2007, Granular Matter 9).
     """
+    ratio = np.asarray(damping, float)[..., None]
     r = -STEPS * (np.arange(PHASES) + 0.5) / PHASES  # in units of speed over frequency
-    v = np.full(PHASES, -1.0)
+    v = np.full((*ratio.shape[:-1], PHASES), -1.0)
     for _ in range(int(40.0 / STEPS)):
-        v = v + STEPS * np.where(r < 0.0, np.maximum(-r - 2.0 * damping * v, 0.0), 0.0)
+        v = v + STEPS * np.where(r < 0.0, np.maximum(-r - 2.0 * ratio * v, 0.0), 0.0)
         r = r + STEPS * v
-    return float(np.maximum(v, 0.0).mean())
+    return np.asarray(np.maximum(v, 0.0).mean(axis=-1))
 
 
 @functools.cache
+def _table() -> tuple[np.ndarray, np.ndarray]:
+    """Restitutions [n], rising, and the damping ratios that give them."""
+    ratios = np.linspace(2.0, 0.0, 513)
+    return restitution_of(ratios), ratios
+
+
 def damping_of(restitution: float) -> float:
     """The damping ratio with that restitution, in [LEAST, 1]."""
-    if restitution >= 1.0:
-        return 0.0
-    return float(brentq(lambda x: restitution_of(x) - restitution, 0.0, 2.0, xtol=1e-6))
+    return 0.0 if restitution >= 1.0 else float(np.interp(restitution, *_table()))
 
 
 def reference(restitution: float, timestep: float) -> tuple[float, float]:
