@@ -45,6 +45,9 @@ PLATE = 1.2
 ROUND = 40
 """Sides of a circle."""
 
+SKIRT = 0.01
+"""Share of a terrain's depth that is shown at least."""
+
 LARGE = 3.0
 """An obstacle this many times larger than what bodies need is not shown whole."""
 
@@ -214,7 +217,12 @@ def _outline(radius: float, half: float) -> list[tuple[float, float]]:
 def surface_of(collider: Collider, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] m in the collider's own frame, and faces [F, 3], outward."""
     if collider.vertices is not None and collider.faces is not None:
-        return collider.vertices, collider.faces
+        vertices = collider.vertices
+        if collider.heights is not None:  # it is solid far below; what is shown ends at the floor
+            base, least = float(vertices[:, 2].min()), float(collider.heights.min())
+            floor = min(float(low[2] - collider.position[2]), least - SKIRT * (least - base))
+            vertices = np.column_stack([vertices[:, :2], np.maximum(vertices[:, 2], floor)])
+        return vertices, collider.faces
     if collider.kind == "plane":
         half = PLATE * float(np.linalg.norm(high - low))
         thick = 0.01 * half

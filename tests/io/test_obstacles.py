@@ -16,9 +16,10 @@ from gdpro_sim.asset import import_mesh
 from gdpro_sim.cameras import Cameras
 from gdpro_sim.gaussians import Gaussians, rotation_matrices
 from gdpro_sim.io.images import read_png
-from gdpro_sim.io.obstacles import BASE, FINE, LEAST, Obstacles, with_obstacles
+from gdpro_sim.io.obstacles import BASE, FINE, LEAST, Obstacles, surface_of, with_obstacles
 from gdpro_sim.io.record import record
 from gdpro_sim.io.views import render_file
+from gdpro_sim.meshing.repair import validate
 from gdpro_sim.simulation.colliders import Collider, compile_collider
 from gdpro_sim.simulation.scene import check_scene
 
@@ -114,6 +115,16 @@ def test_a_recorded_run_shows_its_obstacles_again(tmp_path: Path) -> None:
     assert not stage.GetPrimAtPath("/Simulation/Obstacles/sphere_0").GetAttribute("xformOpOrder").Get()
     assert len(stage.GetPrimAtPath("/Simulation/Obstacles").GetChildren()) == 2
     assert np.abs(pictures[1] - pictures[0]).max() > 50
+
+
+@pytest.mark.parametrize(("height", "lowest"), [(0.2, 0.0), (-0.3, -0.302)])
+def test_a_terrain_is_shown_down_to_the_floor(height: float, lowest: float) -> None:
+    heights = [[0.0, 0.1], [0.0, 0.0]]
+    terrain = collider(kind="heightfield", size=[0.4, 0.4], position=[0, 0, height], heights=heights)
+    vertices, faces = surface_of(terrain, LOW, HIGH)
+    assert vertices[:, 2].min() + height == pytest.approx(lowest) and vertices[:, 2].max() == 0.1
+    assert terrain.vertices is not None and terrain.vertices[:, 2].min() == pytest.approx(-0.2)
+    assert validate(vertices, faces).watertight
 
 
 def covariances(gaussians: Gaussians) -> torch.Tensor:
