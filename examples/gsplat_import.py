@@ -13,6 +13,7 @@ that densification looks at. 500 random Gaussians learn an image of two coloured
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import torch
 
@@ -79,9 +80,10 @@ def main(out: str) -> None:
         for optimizer in optimizers:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+    Path(out).parent.mkdir(parents=True, exist_ok=True)
     write_png(out, (renders[0].detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy())
     print(f"mean alpha {alphas.mean().item():.3f}, wrote {out}")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "gsplat_import.png")
+    main(sys.argv[1] if len(sys.argv) > 1 else "out/gsplat_import.png")

@@ -44,6 +44,7 @@ def main(mesh: str, out: str) -> None:
         render_mode="RGB+ED",
     )
     depth = colors[0, ..., 3][alphas[0, ..., 0] > 0.5]
+    Path(out).parent.mkdir(parents=True, exist_ok=True)
     write_png(out, (colors[0, ..., :3].clamp(0, 1) * 255).to(torch.uint8).numpy())
     print(f"{len(g)} Gaussians, depth {float(depth.min()):.3f} to {float(depth.max()):.3f} m, wrote {out}")
 
@@ -51,4 +52,4 @@ def main(mesh: str, out: str) -> None:
 if __name__ == "__main__":
     arguments = sys.argv[1:]
     bunny = Path(warp.__file__).parent / "examples/assets/bunny.usd"
-    main(arguments[0] if arguments else str(bunny), arguments[1] if len(arguments) > 1 else "asset.png")
+    main(arguments[0] if arguments else str(bunny), arguments[1] if len(arguments) > 1 else "out/asset.png")

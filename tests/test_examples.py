@@ -31,7 +31,7 @@ def test_drop_mesh(tmp_path: Path) -> None:
 
 def test_render_asset(tmp_path: Path) -> None:
     assert "Gaussians" in run("render_asset.py", cwd=tmp_path)
-    picture = read_png(tmp_path / "asset.png").astype(float)
+    picture = read_png(tmp_path / "out/asset.png").astype(float)
     middle = picture[200:280, 200:280].mean(axis=(0, 1))
     assert middle[1] > middle[0] > middle[2], "the bunny is green, in the middle of a white picture"
     assert np.all(picture[:5] > 250)
@@ -47,7 +47,7 @@ def test_gsplat_import(tmp_path: Path) -> None:
     output = run("gsplat_import.py", cwd=tmp_path)
     losses = [float(line.split()[3]) for line in output.splitlines() if line.startswith("step")]
     assert len(losses) == 7 and losses[-1] < 1e-3 < 0.1 < losses[0]
-    assert read_png(tmp_path / "gsplat_import.png").shape == (96, 96, 3)
+    assert read_png(tmp_path / "out/gsplat_import.png").shape == (96, 96, 3)
 
 
 @pytest.mark.parametrize("kind", ["gaussians", "surfels"])

@@ -83,8 +83,8 @@ def theirs(python: str, peer: str, mesh: dict[str, Any], **settings: int) -> dic
         path = Path(folder) / "mesh.npz"
         np.savez(path, **mesh)
         script = Path(__file__).with_name("fem_peers.py")
-        command = [python, str(script), peer, str(path), json.dumps(settings)]
-        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        command = [str(Path(python).absolute()), str(script), peer, str(path), json.dumps(settings)]
+        ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
     if ran.returncode:
         raise SystemExit(f"{peer} failed:\n{ran.stderr[-2000:]}")
     return json.loads(ran.stdout.strip().splitlines()[-1])  # type: ignore[no-any-return]
