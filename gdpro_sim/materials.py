@@ -32,8 +32,10 @@ def _values(
     return {**elastic, "friction": friction, "rayleigh_stiffness": damping, **more}
 
 
-def _fluid(bulk: float, viscosity: float, density: float) -> dict[str, float | str]:
-    return {"model": "fluid", "bulk_modulus": bulk, "viscosity": viscosity, "density": density}
+def _fluid(bulk: float, viscosity: float, density: float, damping: float = 0.0) -> dict[str, float | str]:
+    """damping: s, of its volume: the bulk viscosity over the bulk modulus."""
+    values: dict[str, float | str] = {"bulk_modulus": bulk, "viscosity": viscosity, "density": density}
+    return {"model": "fluid", **values, "rayleigh_stiffness": damping}
 
 
 def _paste(
@@ -140,8 +142,10 @@ PRESETS: dict[str, dict[str, float | str]] = {
     # Water at 20 C, but for its bulk modulus (2.2 GPa): sound at 22 m/s serves flows up to 2 m/s.
     "water": _fluid(5.0e5, 1.0e-3, 998.0),
     # Honey of 16 to 17 % water: 19 Pa s at 21 C, 7 Pa s at 25 C (Krell 1996, "Value-added products from
-    # beekeeping", FAO Agricultural Services Bulletin 124, ch. 2).
-    "honey": _fluid(5.0e5, 1.0e1, 1420.0),
+    # beekeeping", FAO Agricultural Services Bulletin 124, ch. 2). Bulk viscosity: ten times that in shear,
+    # chosen; liquids have one to a few times as much (Dukhin & Goetz 2009, J. Chem. Phys. 130). Without, its
+    # soft volume would rebound from an impact, and burst it into crumbs.
+    "honey": _fluid(5.0e5, 1.0e1, 1420.0, 2.0e-4),
     # Orders of magnitude: yield stress and fall of viscosity with rate of commercial toothpastes.
     "toothpaste": _paste(2.0e5, 2.0e3, 1300.0, 1.5e2, 5.0e1, 0.5),
     # Dry soap foams: shear modulus 240 Pa and yield strain of some tenth at bubbles of 30 um, index near 0.4
