@@ -1,4 +1,4 @@
-"""Colliders on a device, as `gdpro_sim.kernels.colliders` takes them."""
+"""Colliders on a device, as `gdpro_sim.kernels.colliders` takes them, and whether bodies can meet them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from gdpro_sim.errors import SceneError
 from gdpro_sim.kernels import colliders as kernels
 from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.conditions import pose_at
+from gdpro_sim.simulation.model import Model
 
 KINDS = {
     "plane": kernels.PLANE,
@@ -56,4 +58,22 @@ def placed(collider: Collider, time: float) -> tuple[np.ndarray, np.ndarray]:
     return turn @ collider.rotation, turn @ collider.position + shift
 
 
-__all__ = ["ColliderShape", "placed"]
+def check_not_swallowed(model: Model) -> None:
+    """Raise SceneError for a collider whose middle starts inside a body of tets: it would never come out."""
+    for collider in model.colliders:
+        if collider.kind == "plane" or collider.heights is not None:
+            continue
+        rotation, middle = placed(collider, 0.0)
+        if collider.vertices is not None:
+            middle = rotation @ collider.vertices.mean(axis=0) + middle
+        for body in model.bodies:
+            corners = model.vertices[model.tets[slice(*body.tet_range)]].astype(np.float64)
+            edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+            weights = np.linalg.solve(edges, (middle - corners[:, 0])[..., None])[..., 0]
+            if ((weights >= 0.0).all(axis=1) & (weights.sum(axis=1) <= 1.0)).any():
+                raise SceneError(
+                    f"collider {collider.name!r} starts inside body {body.name!r}; move one of them"
+                )
+
+
+__all__ = ["ColliderShape", "check_not_swallowed", "placed"]

@@ -16,6 +16,7 @@ from gdpro_sim.errors import SceneError
 from gdpro_sim.materials import Material
 from gdpro_sim.meshing.tetmesh import TetMesh
 from gdpro_sim.simulation.animation_options import AnimationOptions
+from gdpro_sim.simulation.collider_shapes import check_not_swallowed
 from gdpro_sim.simulation.colliders import MeshCollider, compile_collider
 from gdpro_sim.simulation.compile_animation import (
     animated_asset,
@@ -251,6 +252,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         fem=options.settings(),
         device=device,
     )
+    check_not_swallowed(model)
     return apply_conditions(scene, model)
 
 

@@ -12,6 +12,7 @@ import torch
 
 from gdpro_sim.asset import Asset
 from gdpro_sim.device import resolve_device
+from gdpro_sim.errors import SceneError, SolverError
 from gdpro_sim.simulation.callbacks import with_code
 from gdpro_sim.simulation.colliders import Collider
 from gdpro_sim.simulation.compile import compile_scene, load_assets
@@ -37,7 +38,10 @@ class Simulation:
         self.assets = assets
         self.device = resolve_device(device)
         self.model: Model = compile_scene(scene, assets, device=self.device)
-        self.solver = solver_of(self.model)
+        try:
+            self.solver = solver_of(self.model)
+        except SolverError as error:  # before the first step it is the scene that asks for what cannot be
+            raise SceneError(f"{scene.name}: {error}") from error
         self.milliseconds: dict[str, float] = {"solve": 0.0, "resplat": 0.0}
         self._time = 0.0
 

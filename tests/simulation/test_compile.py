@@ -271,6 +271,19 @@ def test_wind_blows_on_the_named_bodies(ball: Asset) -> None:
     assert upper.faces.min() >= model.bodies[1].vertex_range[0]
 
 
+def test_a_collider_inside_a_body_is_refused(ball: Asset) -> None:
+    body = {"name": "ball", "asset": "ball.ply", "position": [0, 0, 0.5]}
+    middle = [0.0, 0.0, 0.5 + 0.5 * float(np.ptp(ball.tets.vertices[:, 2]))]  # type: ignore[union-attr]
+    for height, refused in ((0.0, True), (2.0, False)):
+        at = [middle[0], middle[1], middle[2] + height]
+        scene = check_scene({"bodies": body, "colliders": {"kind": "sphere", "radius": 0.02, "position": at}})
+        if refused:
+            with pytest.raises(SceneError, match="'sphere' starts inside body 'ball'"):
+                compile_scene(scene, {"ball": ball})
+        else:
+            assert len(compile_scene(scene, {"ball": ball}).colliders) == 1
+
+
 def test_colliders_are_compiled(ball: Asset, tmp_path: Path) -> None:
     """A ball that comes to rest in a bowl made of a tilted box and a mesh, and one that is pushed."""
     trimesh.creation.box((1.0, 1.0, 0.1)).export(tmp_path / "plate.ply")
