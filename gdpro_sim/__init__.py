@@ -6,9 +6,14 @@ Public names are imported on first use, so `import gdpro_sim` is light and start
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+# Torch's threads wait for work by spinning, on the cores that ours need. OpenMP reads this when torch is
+# imported: where that came first, it changes nothing.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 _PUBLIC = {
     "Asset": "gdpro_sim.asset",

@@ -9,21 +9,17 @@ must write memory no other index writes (plain Warp atomics are not atomic on th
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import itertools
 import os
 import sys
 import tempfile
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
+from gdpro_sim.crew import Command, Crew, Plan
 from gdpro_sim.errors import DeviceError
-from gdpro_sim.kernels.threads import run_pieces
 
 if TYPE_CHECKING:
     import torch
@@ -55,7 +51,7 @@ def _start_warp() -> None:
 _start_warp()
 
 _threads: int | None = None
-_pool: ThreadPoolExecutor | None = None
+_crew: Crew | None = None
 
 
 def resolve_device(device: str = "auto") -> str:
@@ -94,75 +90,43 @@ def thread_count() -> int:
 
 def set_thread_count(count: int) -> None:
     """Set the number of CPU threads used for one launch; `count` >= 1."""
-    global _threads, _pool
+    global _threads, _crew
     if count < 1:
         raise DeviceError(f"thread count must be >= 1, got {count}")
     _threads = count
-    if _pool is not None:
-        _pool.shutdown()
-        _pool = None
+    if _crew is not None and _crew.threads != count:
+        _crew.close()
+        _crew = None
 
 
 PIECES = 4
 """Ranges for each thread, so that one that is held up leaves work to the others."""
 
 
-def _workers() -> ThreadPoolExecutor:
-    global _pool
-    if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=thread_count(), thread_name_prefix="gdpro")
-    return _pool
+def _crew_of() -> Crew:
+    global _crew
+    if _crew is None:
+        _crew = Crew(thread_count())
+    return _crew
 
 
-def run_chunks(function: Callable[[int, int], Any], count: int, minimum: int = 1) -> None:
-    """Call `function(begin, end)` over contiguous ranges that cover `range(count)`, from several threads.
+def split(count: int, minimum: int = 1) -> list[int]:
+    """Bounds of contiguous ranges that cover `range(count)`, a few for each CPU thread.
 
-    `minimum` is the fewest indices worth a range of their own. Threads take ranges in ascending order as they
-    come free. Returns, or raises one of the exceptions, when every range has ended: nothing writes to the
-    caller's memory afterwards.
+    `minimum` is the fewest indices worth a range of their own.
     """
-    if count <= 0:
-        return
-    pieces = min(PIECES * thread_count(), max(1, count // max(1, minimum)))
-    threads = min(thread_count(), pieces)
-    if threads == 1:
-        function(0, count)
-        return
-    pool = _workers()
-    bounds = [count * i // pieces for i in range(pieces + 1)]
-    numbers = iter(range(pieces))
-    lock = threading.Lock()
-
-    def work() -> None:
-        while True:
-            with lock:
-                piece = next(numbers, None)
-            if piece is None:
-                return
-            function(bounds[piece], bounds[piece + 1])
-
-    futures = [pool.submit(work) for _ in range(1, threads)]
-    try:
-        work()
-        wait(futures)
-    except BaseException:
-        with lock:
-            for _ in numbers:  # leave nothing to begin
-                pass
-        wait(futures)  # an interrupt ends the wait above
-        raise
-    for future in futures:
-        future.result()
+    pieces = 1 if thread_count() == 1 else min(PIECES * thread_count(), max(1, count // max(1, minimum)))
+    return [count * i // pieces for i in range(pieces + 1)]
 
 
-def _forget_pool() -> None:
+def _forget_crew() -> None:
     """A forked child has none of its parent's threads: start anew there."""
-    global _pool
-    _pool = None
+    global _crew
+    _crew = None
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pool)
+    os.register_at_fork(after_in_child=_forget_crew)
 
 
 def device_name(tensor: torch.Tensor) -> str:
@@ -219,13 +183,30 @@ def launch_chunked(
     if device != "cpu":
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device)
         return
-    if thread_count() > 1 and count >= 2 * minimum:
-        wp.load_module(kernel.module, device="cpu")
+    bounds = split(count, minimum)
+    if len(bounds) == 2:
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device="cpu")
+    else:
+        launch_ranges(kernel, bounds, [*inputs, *outputs])
 
-    def launch(begin: int, end: int) -> None:
-        wp.launch(kernel, dim=end - begin, inputs=[begin, *inputs], outputs=list(outputs), device="cpu")
 
-    run_chunks(launch, count, minimum)
+def launch_ranges(
+    kernel: wp.Kernel,
+    bounds: Sequence[int],
+    arguments: Sequence[Any],
+    varying: Mapping[str, Sequence[int]] | None = None,
+) -> None:
+    """Launch `kernel(start, *arguments)` on the CPU over the ranges between `bounds`, side by side.
+
+    varying: arguments by name that differ from range to range, a value for each; as `arguments` have them
+             they do not count
+    """
+    ranges = list(itertools.pairwise(bounds))
+    if not ranges or bounds[-1] == bounds[0]:
+        return
+    inputs = [bounds[0], *arguments]
+    recorded = wp.launch(kernel, dim=bounds[-1] - bounds[0], inputs=inputs, device="cpu", record_cmd=True)
+    _crew_of().run(Plan(Command(recorded, []), ranges, varying))
 
 
 class Launches:
@@ -291,117 +272,48 @@ class _Recorded:
     def __init__(self, kernel: wp.Kernel, arguments: list[Any], device: str) -> None:
         self._kernel, self._arguments, self._device = kernel, arguments, device
         self._places = [k for k, argument in enumerate(arguments) if not _is_held(argument)]
-        self._commands: dict[tuple[int, int], _Command] = {}
-        self._plans: dict[tuple[int, int], _Plan] = {}
+        self._commands: dict[tuple[int, int], Command] = {}
+        self._plans: dict[tuple[int, int], Plan] = {}
 
     def launch(self, begin: int, end: int, numbers: list[Any]) -> None:
         """`numbers` are the arguments that are no arrays or structs, in order."""
-        self._command(begin, end, numbers).launch()
+        command = self._commands.get((begin, end))
+        if command is None:
+            command = self._commands[begin, end] = self._record(begin, end, numbers)
+        else:
+            self._renew(command, numbers)
+        command.launch()
 
     def spread(self, count: int, pieces: int, numbers: list[Any]) -> None:
         """Launch over `count` indices in `pieces` ranges, which threads of the CPU take as they come free."""
-        bounds = [count * i // pieces for i in range(pieces + 1)]
-        commands = [self._command(a, b, numbers) for a, b in itertools.pairwise(bounds)]
         plan = self._plans.get((count, pieces))
         if plan is None:
-            plan = self._plans[count, pieces] = _Plan(commands)
-        plan.run()
+            bounds = [count * i // pieces for i in range(pieces + 1)]
+            plan = Plan(self._record(0, count, numbers), list(itertools.pairwise(bounds)))
+            self._plans[count, pieces] = plan
+        elif self._renew(plan.command, numbers):
+            plan.refresh()
+        _crew_of().run(plan)
 
-    def _command(self, begin: int, end: int, numbers: list[Any]) -> _Command:
-        """The launch over a range, with these numbers."""
-        command = self._commands.get((begin, end))
-        if command is None:
-            arguments = list(self._arguments)
-            for place, number in zip(self._places, numbers, strict=True):
-                arguments[place] = number
-            recorded = wp.launch(
-                self._kernel,
-                dim=end - begin,
-                inputs=[begin, *arguments],
-                device=self._device,
-                record_cmd=True,
-            )
-            command = self._commands[begin, end] = _Command(recorded, list(numbers))
-        else:
-            known = command.numbers
-            for k, number in enumerate(numbers):
-                if known[k] is not number and known[k] != number:
-                    command.put(self._places[k] + 1, number)
-                    known[k] = number
-        return command
-
-
-class _Plan:
-    """Recorded launches of one kernel on the CPU, run side by side by several threads."""
-
-    def __init__(self, commands: list[_Command]) -> None:
-        addresses = np.array([command.addresses() for command in commands], np.uint64)
-        self._counter: wp.array = wp.zeros(1, dtype=int, device="cpu")
-        self._next = self._counter.numpy()
-        self._pieces = len(commands)
-        arrays: list[wp.array] = [wp.array(a, dtype=wp.uint64, device="cpu") for a in addresses.T.copy()]
-        inputs = [len(commands), commands[0].function(), *arrays, self._counter]
-        self._held = (commands, arrays)
-        self._runner = _Command(
-            wp.launch(run_pieces, dim=1, inputs=inputs, device="cpu", record_cmd=True), []
+    def _record(self, begin: int, end: int, numbers: list[Any]) -> Command:
+        arguments = list(self._arguments)
+        for place, number in zip(self._places, numbers, strict=True):
+            arguments[place] = number
+        inputs = [begin, *arguments]
+        recorded = wp.launch(
+            self._kernel, dim=end - begin, inputs=inputs, device=self._device, record_cmd=True
         )
+        return Command(recorded, list(numbers))
 
-    def run(self) -> None:
-        """Returns when all pieces have ended."""
-        self._next[0] = 0
-        threads = min(thread_count(), self._pieces)
-        futures = [_workers().submit(self._runner.launch) for _ in range(1, threads)]
-        try:
-            self._runner.launch()
-            wait(futures)
-        except BaseException:
-            self._next[0] = self._pieces  # leave nothing to begin
-            wait(futures)  # an interrupt ends the wait above
-            raise
-        for future in futures:
-            future.result()
-
-
-class _Command:
-    """A recorded launch. On a CPU its arguments lie side by side in memory, as the kernel takes them.
-
-    `wp.Launch.launch` puts them there anew at every launch, which takes longer than a small kernel runs.
-    """
-
-    def __init__(self, command: wp.Launch, numbers: list[Any]) -> None:
-        self._command, self.numbers = command, numbers
-        self._direct = command.device.is_cpu and command.block_dim <= 1
-        if not self._direct:
-            return
-        arguments = command.kernel.adj.args
-        bounds, *params = command.params
-        self._names = [argument.label for argument in arguments]
-        fields = [(name, type(param)) for name, param in zip(self._names, params, strict=True)]
-        self._arguments = type("Arguments", (ctypes.Structure,), {"_fields_": fields})()
-        for name, param in zip(self._names, params, strict=True):
-            setattr(self._arguments, name, param)
-        self._call = command.hooks.forward
-        self._where = ctypes.byref(bounds), ctypes.byref(self._arguments)
-
-    def put(self, index: int, value: Any) -> None:
-        """Give argument number `index` another value."""
-        self._command.set_param_at_index(index, value)
-        if self._direct:
-            setattr(self._arguments, self._names[index], self._command.params[index + 1])
-
-    def function(self) -> int:
-        """Address of the compiled kernel, on a CPU."""
-        return ctypes.cast(self._call, ctypes.c_void_p).value or 0
-
-    def addresses(self) -> tuple[int, int]:
-        """Those of its bounds and arguments, on a CPU."""
-        return ctypes.addressof(self._command.params[0]), ctypes.addressof(self._arguments)
-
-    def launch(self) -> None:
-        if self._direct:
-            self._call(*self._where)
-        else:
-            self._command.launch()
+    def _renew(self, command: Command, numbers: list[Any]) -> bool:
+        """Put numbers into a command; whether any was new."""
+        known, changed = command.numbers, False
+        for k, number in enumerate(numbers):
+            if known[k] is not number and known[k] != number:
+                command.put(self._places[k] + 1, number)
+                known[k] = number
+                changed = True
+        return changed
 
 
 __all__ = [
@@ -410,9 +322,10 @@ __all__ = [
     "beside_torch",
     "device_name",
     "launch_chunked",
+    "launch_ranges",
     "resolve_device",
-    "run_chunks",
     "serial_torch",
     "set_thread_count",
+    "split",
     "thread_count",
 ]

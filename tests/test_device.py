@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 
@@ -19,52 +20,72 @@ def threads_as_before():
     device.set_thread_count(before)
 
 
+@wp.kernel
+def visit(start: int, seen: wp.array[int], value: int):
+    i = start + wp.tid()
+    seen[i] = seen[i] + value
+
+
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize(("count", "minimum"), [(0, 1), (1, 1), (7, 1), (1000, 1), (1000, 300), (10, 100)])
 def test_ranges_cover_everything_once(threads: int, count: int, minimum: int) -> None:
     device.set_thread_count(threads)
-    seen = [0] * count
-
-    def work(begin: int, end: int) -> None:
-        assert begin < end
-        for i in range(begin, end):
-            seen[i] += 1
-
-    device.run_chunks(work, count, minimum)
-    assert seen == [1] * count
+    bounds = device.split(count, minimum)
+    assert bounds[0] == 0 and bounds[-1] == count
+    assert len(bounds) == 2 or min(np.diff(bounds)) >= minimum
+    seen = wp.zeros(count, dtype=int, device="cpu")
+    for _ in range(20):
+        device.launch_chunked(visit, count, [seen, 3], device="cpu", minimum=minimum)
+    assert (seen.numpy() == 60).all()
 
 
-def test_a_thread_that_is_held_up_leaves_work_to_the_others() -> None:
+def test_arguments_that_differ_from_range_to_range() -> None:
     device.set_thread_count(2)
-    done: dict[int, int] = {}
-    held = threading.get_ident()
-
-    def work(begin: int, end: int) -> None:
-        if threading.get_ident() == held:
-            time.sleep(0.2)
-        done[threading.get_ident()] = done.get(threading.get_ident(), 0) + 1
-
-    device.run_chunks(work, 8)
-    assert sum(done.values()) == 8
-    assert done.get(held, 0) <= 2
+    seen = wp.zeros(10, dtype=int, device="cpu")
+    device.launch_ranges(visit, [2, 4, 4, 9], [seen, 0], {"value": [5, 6, 7]})
+    assert seen.numpy().tolist() == [0, 0, 5, 5, 7, 7, 7, 7, 7, 0]
 
 
-def test_an_exception_ends_the_rest_and_is_raised() -> None:
-    device.set_thread_count(2)
-    begun = []
-
-    def work(begin: int, end: int) -> None:
-        begun.append(begin)
-        time.sleep(0.05)
-        if begin == 0:
-            raise RuntimeError("no")
-
-    with pytest.raises(RuntimeError, match="no"):
-        device.run_chunks(work, 8)
-    count = len(begun)
-    assert count <= 8
+def test_threads_sleep_without_work_and_wake_again() -> None:
+    device.set_thread_count(3)
+    seen = wp.zeros(100, dtype=int, device="cpu")
+    for pause in (0.0, 0.01, 0.0):
+        time.sleep(pause)
+        device.launch_chunked(visit, 100, [seen, 1], device="cpu", minimum=1)
+    assert (seen.numpy() == 3).all()
+    time.sleep(0.05)
+    idle = time.process_time()
     time.sleep(0.2)
-    assert len(begun) == count
+    assert time.process_time() - idle < 0.1
+
+
+def test_launches_of_several_threads_do_not_mix() -> None:
+    device.set_thread_count(2)
+    all_seen = [wp.zeros(500, dtype=int, device="cpu") for _ in range(3)]
+
+    def launch(seen: wp.array) -> None:
+        for _ in range(200):
+            device.launch_chunked(visit, 500, [seen, 1], device="cpu", minimum=1)
+
+    threads = [threading.Thread(target=launch, args=(seen,)) for seen in all_seen]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all((seen.numpy() == 200).all() for seen in all_seen)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_child_has_threads_of_its_own() -> None:
+    device.set_thread_count(2)
+    seen = wp.zeros(100, dtype=int, device="cpu")
+    device.launch_chunked(visit, 100, [seen, 1], device="cpu", minimum=1)
+    child = os.fork()
+    if child == 0:
+        device.launch_chunked(visit, 100, [seen, 1], device="cpu", minimum=1)
+        os._exit(0 if (seen.numpy() == 2).all() else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    assert (seen.numpy() == 1).all()
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS: list[set[str]] = [
-    {"errors", "files", "kernels", "device"},
+    {"errors", "files", "kernels", "crew", "device"},
     {"gaussians", "cameras", "binding", "materials"},
     {"splatting"},
     {"meshing", "asset"},
@@ -26,6 +26,8 @@ WITHIN = {
     ("files", "errors"),
     ("device", "errors"),
     ("device", "kernels"),
+    ("device", "crew"),
+    ("crew", "kernels"),
     ("binding", "gaussians"),
     ("asset", "meshing"),
 }

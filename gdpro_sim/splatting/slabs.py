@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import PIECES, run_chunks, thread_count
+from gdpro_sim.device import PIECES, launch_ranges, thread_count
 from gdpro_sim.kernels import slabs as kernels
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting import buffers
@@ -41,16 +41,7 @@ def launch_tiles(kernel: wp.Kernel, offsets: torch.Tensor, arguments: list[Any])
     if tiles == 0:
         return
     pieces = 1 if threads == 1 else min(PIECES * threads, -(-tiles // SMALLEST_PIECE))
-    if pieces > 1:
-        wp.load_module(kernel.module, device="cpu")
-    bounds = balanced_slabs(offsets[:-1], offsets[1:], pieces)
-
-    def launch(begin: int, end: int) -> None:
-        first, last = bounds[begin], bounds[end]
-        if first < last:
-            wp.launch(kernel, dim=last - first, inputs=[first, *arguments], device="cpu")
-
-    run_chunks(launch, pieces)
+    launch_ranges(kernel, balanced_slabs(offsets[:-1], offsets[1:], pieces), arguments)
 
 
 def add_over_tiles(
@@ -80,8 +71,6 @@ def add_over_tiles(
         arguments = [array(none, wp.int32), sums_array, array(none, wp.int32), array(spills, wp.float32)]
         wp.launch(kernel, dim=tiles, inputs=[0, *inputs, rects_array, 0, tiles, *arguments], device="cpu")
         return sums
-    wp.load_module(kernel.module, device="cpu")
-    wp.load_module(kernels, device="cpu")
     bounds = balanced_slabs(lists.offsets[:-1], stops, slabs)
     # A tile spills no more than its entries, so its spills have place at their numbers. Most of this
     # memory is never touched.
@@ -91,21 +80,11 @@ def add_over_tiles(
     spills_array = [array(spill_ids, wp.int32), array(spills, wp.float32)]
     arguments = [array(lists.offsets, wp.int32), sums_array, *spills_array]
 
-    def run(first: int, last: int) -> None:
-        for slab in range(first, last):
-            begin, end = bounds[slab], bounds[slab + 1]
-            whole = [begin, *inputs, rects_array, begin, end, *arguments]
-            if begin < end:
-                wp.launch(kernel, dim=end - begin, inputs=whole, device="cpu")
-
-    run_chunks(run, slabs)
+    whole = [*inputs, rects_array, 0, tiles, *arguments]
+    launch_ranges(kernel, bounds, whole, {"slab_begin": bounds[:-1], "slab_end": bounds[1:]})
     parts = slabs if entries >= SMALLEST_MERGE else 1
     spilled = [parts, array(lists.offsets, wp.int32), *spills_array, sums_array]
-
-    def merge(first: int, last: int) -> None:
-        wp.launch(kernels.merge_spills, dim=last - first, inputs=[first, *spilled], device="cpu")
-
-    run_chunks(merge, parts)
+    launch_ranges(kernels.merge_spills, range(parts + 1), spilled)
     return sums
 
 
