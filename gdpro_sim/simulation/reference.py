@@ -27,6 +27,7 @@ From Python, `motion` takes a function, and the loop over the frames may look at
 def swing(time):  # s -> translation in m, rotation vector in degrees
     return (0, 0, 0), (0, 30 * math.sin(4 * time), 0)
 
+
 for frame in gdpro_sim.simulate(scene):
     if frame.diagnostics.contacts:
         break
