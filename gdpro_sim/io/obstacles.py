@@ -30,6 +30,9 @@ BASE, PART, LEAST = 150_000, 10_000, 300
 FINE = 2.0
 """Pixels between neighbours of a part's Gaussians, from where the camera first stands."""
 
+BESIDE = 0.5
+"""Resolution of parts that lie beside the picture, over that of those within."""
+
 ACROSS = 600.0
 """Pixels that what is shown measures where no camera is given."""
 
@@ -131,7 +134,8 @@ def _shares(
 
 
 def _resolution(vertices: np.ndarray, view: Cameras) -> float:
-    """Pixels per metre at which a camera sees a part of vertices [V, 3] m; 0 where it does not."""
+    """Pixels per metre at which a camera sees a part of vertices [V, 3] m: 0 behind it, and a share of that
+    beside the picture, as what lies there may come in."""
     matrix, k = view.viewmats[0].double().numpy(), view.Ks[0].double().numpy()
     points = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     points = points[points[:, 2] > 0.0]
@@ -139,7 +143,7 @@ def _resolution(vertices: np.ndarray, view: Cameras) -> float:
         return 0.0
     u, v = (k[axis, axis] * points[:, axis] / points[:, 2] + k[axis, 2] for axis in (0, 1))
     if u.max() < 0.0 or u.min() > view.width or v.max() < 0.0 or v.min() > view.height:
-        return 0.0
+        return BESIDE * float(k[0, 0] / np.median(points[:, 2]))
     seen = (u > 0.0) & (u < view.width) & (v > 0.0) & (v < view.height)
     return float(k[0, 0] / np.median(points[seen if seen.any() else slice(None), 2]))
 

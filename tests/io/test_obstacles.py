@@ -146,17 +146,18 @@ def test_what_moves_is_drawn_turned_and_shifted() -> None:
 
 
 def test_parts_of_a_base_are_drawn_as_finely_as_they_are_seen() -> None:
-    def part(half: float, x: float) -> Collider:
-        place = np.array([x, 0.0, 0.0])
+    def part(half: float, x: float, y: float = 0.0) -> Collider:
+        place = np.array([x, y, 0.0])
         return Collider("part", "box", size=(half, half, half), position=place, color=(0.5, 0.5, 0.5))
 
     view = Cameras.look_at([3.0, 0.0, 0.0], [0.0, 0.0, 0.0], vertical_fov=0.7, width=200, height=200)
-    parts = [part(0.1, 0.0), part(0.1, 1.5), part(0.05, 0.0), part(0.1, 6.0)]
+    parts = [part(0.1, 0.0), part(0.1, 1.5), part(0.05, 0.0), part(0.1, 6.0), part(0.1, 1.5, 1.0)]
     shown = Obstacles(parts, LOW, HIGH, view=view)
-    far, near, small, behind = (count for _, count in shown.counts)
+    far, near, small, behind, beside = (count for _, count in shown.counts)
     exact = 6 * 0.2**2 * (view.Ks[0, 0, 0].item() / 1.5 / FINE) ** 2
     assert near == pytest.approx(exact, rel=0.3)
     assert 0.2 < far / near < 0.35
     assert far > small and behind <= LEAST
+    assert 0.15 < beside / near < 0.35, "it may come in"
     many = Obstacles([part(0.2, 1.5)] * 40, LOW, HIGH, view=view).counts
     assert sum(count for _, count in many) <= BASE
