@@ -157,17 +157,17 @@ class Crew:
             told = self._give.arguments
             told.function, told.bounds, told.arguments, told.count = plan.job
             self._give.launch()
-            self._finish(plan.count)
-        finally:
+        finally:  # Ctrl-C may come before this line: the pieces are at work all the same
+            self._finish()
             self._busy.release()
 
-    def _finish(self, count: int) -> None:
+    def _finish(self) -> None:
         interrupted: BaseException | None = None
-        while int(self._view[kernels.DONE]) != count:
+        while int(self._view[kernels.DONE]) != int(self._view[kernels.COUNT]):
             try:
                 time.sleep(NAP)
                 self._wait.launch()
-            except BaseException as error:  # Ctrl-C: the pieces write to the caller's memory until they end
+            except BaseException as error:  # they write to the caller's memory until they end
                 interrupted = error
         if interrupted is not None:
             raise interrupted

@@ -25,6 +25,8 @@ DONE = 8
 
 AWAKE = 16
 
+COUNT = 27
+
 _JOB = """
     unsigned long long* const ticket = (unsigned long long*)job.data;
     unsigned long long* const finished = ticket + 8;
