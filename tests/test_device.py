@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 
@@ -73,6 +74,29 @@ def test_launches_of_several_threads_do_not_mix() -> None:
     for thread in threads:
         thread.join()
     assert all((seen.numpy() == 200).all() for seen in all_seen)
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no timers here")
+def test_an_interrupted_launch_is_whole_or_not_at_all() -> None:
+    device.set_thread_count(2)
+    seen = wp.zeros(5000, dtype=int, device="cpu")
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for k in range(60):
+            with pytest.raises(KeyboardInterrupt):
+                signal.setitimer(signal.ITIMER_REAL, 0.002 + 1e-5 * k)
+                while True:
+                    device.launch_chunked(visit, 5000, [seen, 1], device="cpu", minimum=1)
+            time.sleep(1e-3)
+            assert np.ptp(seen.numpy()) == 0
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert seen.numpy()[0] > 0
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
