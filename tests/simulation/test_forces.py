@@ -410,7 +410,7 @@ def test_pins_go_where_they_are_told(rule: str) -> None:
     np.testing.assert_allclose(found, end, atol=1e-9)
 
 
-@pytest.mark.parametrize("speed", [0.1, 2.0])
+@pytest.mark.parametrize("speed", [0.1, 2.0, 10.0])
 def test_pins_push_what_rests_on_them(speed: float) -> None:
     """A body held by all its vertices sets off at once, and takes another with it."""
     plate, tets = tet_box((2, 2, 2), (SIDE,) * 3)

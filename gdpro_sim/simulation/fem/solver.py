@@ -380,7 +380,8 @@ class SolverFEM:
         return report, potential.step_measures()
 
     def _choose_start(self) -> float:
-        """Put the lowest guess that can be reached into the trial: resting, coasting, falling.
+        """Put the lowest guess that can be reached into the trial: resting, coasting, falling; where none of
+        them can, since pins push into what rests on them, everything carried along.
 
         Returns its energy; infinity where none can be reached or has a finite one.
         """
@@ -395,6 +396,13 @@ class SolverFEM:
                 last = guess
                 if energy < lowest:
                     best, lowest = guess, energy
+        if best is None and potential.fixed.any():
+            ways = (self._held.numpy() - x.numpy())[potential.fixed]
+            carried = self._resting
+            potential.combine(x, 1.0, x, 0.0, carried, wp.vec3d(*ways.mean(axis=0)))
+            potential.hold(self._held, carried)
+            if potential.reachable(x, carried):
+                best, last, lowest = carried, carried, potential.energy(carried)
         if best is None:
             return math.inf
         wp.copy(potential.trial, best)
