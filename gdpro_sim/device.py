@@ -183,11 +183,7 @@ def launch_chunked(
     if device != "cpu":
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device)
         return
-    bounds = split(count, minimum)
-    if len(bounds) == 2:
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device="cpu")
-    else:
-        launch_ranges(kernel, bounds, [*inputs, *outputs])
+    launch_ranges(kernel, split(count, minimum), [*inputs, *outputs])
 
 
 def launch_ranges(
@@ -201,12 +197,15 @@ def launch_ranges(
     varying: arguments by name that differ from range to range, a value for each; as `arguments` have them
              they do not count
     """
-    ranges = list(itertools.pairwise(bounds))
-    if not ranges or bounds[-1] == bounds[0]:
+    begin, count = bounds[0], bounds[-1] - bounds[0]
+    if count == 0:
         return
-    inputs = [bounds[0], *arguments]
-    recorded = wp.launch(kernel, dim=bounds[-1] - bounds[0], inputs=inputs, device="cpu", record_cmd=True)
-    _crew_of().run(Plan(Command(recorded, []), ranges, varying))
+    inputs = [begin, *arguments]
+    if len(bounds) == 2 and not varying:
+        wp.launch(kernel, dim=count, inputs=inputs, device="cpu")
+        return
+    recorded = wp.launch(kernel, dim=count, inputs=inputs, device="cpu", record_cmd=True)
+    _crew_of().run(Plan(Command(recorded, []), list(itertools.pairwise(bounds)), varying))
 
 
 class Launches:

@@ -58,7 +58,7 @@ def placed(collider: Collider, time: float) -> tuple[np.ndarray, np.ndarray]:
     return turn @ collider.rotation, turn @ collider.position + shift
 
 
-def check_not_swallowed(model: Model) -> None:
+def check_not_swallowed(where: str, model: Model) -> None:
     """Raise SceneError for a collider whose middle starts inside a body of tets: it would never come out."""
     for collider in model.colliders:
         if collider.kind == "plane" or collider.heights is not None:
@@ -72,7 +72,7 @@ def check_not_swallowed(model: Model) -> None:
             weights = np.linalg.solve(edges, (middle - corners[:, 0])[..., None])[..., 0]
             if ((weights >= 0.0).all(axis=1) & (weights.sum(axis=1) <= 1.0)).any():
                 raise SceneError(
-                    f"collider {collider.name!r} starts inside body {body.name!r}; move one of them"
+                    f"{where}: collider {collider.name!r} starts inside body {body.name!r}; move one of them"
                 )
 
 

@@ -252,7 +252,7 @@ def compile_scene(scene: Scene, assets: dict[str, Asset], *, device: str = "cpu"
         fem=options.settings(),
         device=device,
     )
-    check_not_swallowed(model)
+    check_not_swallowed(scene.name, model)
     return apply_conditions(scene, model)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -139,14 +140,14 @@ class Placed:
         return f"the body spans {low} to {high} m"
 
 
-class Faced(Placed):
+class Faced(Placed, ABC):
     """A body with a surface: faces [f, 3], outward, from its own first point."""
 
     faces: np.ndarray
 
+    @abstractmethod
     def carried(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Corners [n, 4] int32 of the model and weights [n, 4] that carry points [n, 3] m along."""
-        raise NotImplementedError
 
     def place(self, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Where corners [4] of the model with weights [4] carry a point at the start, [3] m."""

@@ -42,6 +42,7 @@ class ConjugateGradient:
     right_hand_side:   [P] vec3d
     solution:          [P] vec3d
     residual:          [P] vec3d, b - A x of the last solve as the recurrence carries it
+    six:               [P, 3, 6] float64 NumPy, zero at first: what `product_six` multiplies
     """
 
     def __init__(self, topology: Topology, device: str) -> None:
@@ -69,6 +70,9 @@ class ConjugateGradient:
         self._six, self._product_six = (
             wp.zeros(24 * self.rows, dtype=wp.float64, device=device) for _ in range(2)
         )
+        # On the CPU this is the array's own memory.
+        self._padded = self._six.numpy().reshape(self.rows, 3, 8)
+        self.six = self._padded[..., :6]
         self._dots = wp.zeros(self.blocks, dtype=wp.float64, device=device)
         self._sums = wp.zeros(ROW_BLOCKS, dtype=wp.float64, device=device)
         self._scalars = wp.zeros(8, dtype=wp.float64, device=device)
@@ -124,17 +128,14 @@ class ConjugateGradient:
             found += np.stack([np.bincount(rows, back[:, k], self.rows) for k in range(3)], 1)
         return found
 
-    def product_six(self, x: np.ndarray) -> np.ndarray:
-        """A without G^T D G times x [P, 3, 6], float64."""
-        shape = self.rows, 3, 8
-        padded = self._six.numpy().reshape(shape)
-        padded[..., :6] = x
-        if self.device != "cpu":  # on the CPU it is the array itself
-            self._six.assign(padded.reshape(-1))
+    def product_six(self) -> np.ndarray:
+        """A without G^T D G times `six`, [P, 3, 6] float64, what it is until the next call."""
+        if self.device != "cpu":
+            self._six.assign(self._padded.reshape(-1))
         inputs = [self.offsets, self.columns, self.values]
         inputs += [self._extra_offsets, self._extra_columns, self._extra_values, self._six]
         self._launch(linalg.product_six, self.rows, inputs, [self._product_six])
-        return self._product_six.numpy().reshape(shape)[..., :6]
+        return self._product_six.numpy().reshape(self._padded.shape)[..., :6]
 
     def solve(self, tolerance: float, max_iterations: int) -> SolveReport:
         """Solve until the preconditioned residual has fallen by `tolerance`, starting from zero."""

@@ -47,10 +47,10 @@ class RigidModes:
             for piece, frame in zip(self._pieces, frames, strict=True)
         ):
             return False
-        basis = np.zeros((len(x), 3, 6))
+        basis = system.six
         for piece, (_, arms, radius) in zip(self._pieces, frames, strict=True):
             basis[piece] = rigid_basis(arms / radius)
-        product = system.product_six(basis)
+        product = system.product_six()
         solution = system.solution.numpy()
         for piece in self._pieces:
             z = basis[piece].reshape(-1, 6)
