@@ -81,13 +81,44 @@ TILE_LANES = f"""
     const int y_end = height - tile_y < {TILE} ? height - tile_y : {TILE};
 
     // Read through volatile memory so that they stay in registers: as literals the compiler would fetch each
-    // anew at every block, through a 64-bit address.
+    // anew at every block, through a 64-bit address. The polynomials are those of EXP2.
+#if defined(__AVX512DQ__)
+    const volatile float literals[] = {{0.0f, 1.8671303e-3f, 9.0170298e-3f, 5.5799913e-2f, 2.4016444e-1f,
+        6.9315130e-1f, 1.0f, {float(ALPHA_MAX)!r}f, {float(LOG2_CUTOFF)!r}f, {float(TRANSMITTANCE_MIN)!r}f}};
+#else
     const volatile float literals[] = {{12582912.0f, 1.3264727e-3f, 9.671513e-3f, 5.5507336e-2f,
         2.4022242e-1f,
         6.9314700e-1f, 1.0f, {float(ALPHA_MAX)!r}f, {float(LOG2_CUTOFF)!r}f, {float(TRANSMITTANCE_MIN)!r}f}};
+#endif
     const F magic = (F)literals[0], e5 = (F)literals[1], e4 = (F)literals[2], e3 = (F)literals[3],
         e2 = (F)literals[4], e1 = (F)literals[5], one = (F)literals[6], alpha_max = (F)literals[7],
         cutoff = (F)literals[8], transmittance_min = (F)literals[9];
+    auto exp2_ = [&](F p) {{
+        // p = n + f with whole n, exp2(f) by a minimax polynomial of degree 5, scaled by 2^n (relative error
+        // 2e-7).
+#if defined(__AVX512DQ__)
+        const F f = (F)__builtin_ia32_reduceps512_mask(p, 9, zero, (unsigned short)-1, 4);  // 0 <= f < 1
+#else
+        const F n = p + magic;  // in the last bits of 1.5 * 2^23: |f| <= 1/2
+        const F f = p - (n - magic);
+#endif
+        F e = fma(f, e5, e4);
+        e = fma(e, f, e3);
+        e = fma(e, f, e2);
+        e = fma(e, f, e1);
+        e = fma(e, f, one);
+#if defined(__AVX512DQ__)
+        return (F)__builtin_ia32_scalefps512_mask(e, p, zero, (unsigned short)-1, 4);
+#else
+        I exponent, mantissa;
+        __builtin_memcpy(&exponent, &n, 64);
+        __builtin_memcpy(&mantissa, &e, 64);
+        mantissa += exponent << 23;
+        F raw;
+        __builtin_memcpy(&raw, &mantissa, 64);
+        return raw;
+#endif
+    }};
 
     // Transmittance of the pixels of 16 blocks, with the sign as a flag: T > 0 goes on, T < 0 has stopped
     // at |T|.
@@ -104,21 +135,7 @@ TILE_LANES = f"""
 """CPU snippet: 16 pixel lanes, 16 blocks of 4 x 4 pixels in a tile, at X, Y; `alive` has a bit per block."""
 
 EXP2 = """
-            // exp2(p): p = n + f with |f| <= 1/2 through the 1.5 * 2^23 trick, then a degree-5 minimax
-            // polynomial in f (relative error 2e-7) to whose exponent field n is added.
-            const F n = p + magic;
-            const F f = p - (n - magic);
-            F e = fma(f, e5, e4);
-            e = fma(e, f, e3);
-            e = fma(e, f, e2);
-            e = fma(e, f, e1);
-            e = fma(e, f, one);
-            I exponent, mantissa;
-            __builtin_memcpy(&exponent, &n, 64);
-            __builtin_memcpy(&mantissa, &e, 64);
-            mantissa += exponent << 23;
-            F raw;
-            __builtin_memcpy(&raw, &mantissa, 64);
+            const F raw = exp2_(p);
 """
 """CPU snippet: p -> raw = exp2(p), for -126 < p < 127."""
 

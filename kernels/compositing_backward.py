@@ -18,12 +18,10 @@ from gdpro_sim.kernels.compositing import (
     BATCH,
     BATCH_SIZE,
     BATCH_STATE,
-    BLEND,
     EXP2,
     LN2,
     LOCATE_PIXEL,
     LOCATE_TILE,
-    PASS,
     PIXEL_ALPHA,
     PIXEL_WEIGHT,
     POWER,
@@ -83,7 +81,7 @@ _TILE = f"""
     const bool whole = slab_begin == 0 && slab_end == offsets.shape[0] - 1;
     int spill = whole ? 0 : spill_begins.data[tile];
     F R[16], g0[16], g1[16], g2[16], g3[16];
-    F o0[16], o1[16], o2[16], o3[16], on_alpha[16], left[16];
+    F o0[16], o1[16], o2[16], o3[16], on_alpha[16], left[16], least[16];
     F* const gradients[4] = {{g0, g1, g2, g3}};
     F* const values[4] = {{o0, o1, o2, o3}};
     F* const left_planes[1] = {{left}};
@@ -93,6 +91,9 @@ _TILE = f"""
     read_image(transmittance.data, 1, left_planes);
     if (g_alphas.data) read_image(g_alphas.data, 1, alpha_planes);
     for (int k = 0; k < 16; ++k) {{
+        // What blends leaves no less than what is left in the end, anything behind the stop at least 1/255
+        // less.
+        least[k] = 0.999f * left[k];
         if (!g_alphas.data) on_alpha[k] = zero;
         R[k] = zero;
         for (int i = 0; i < 4; ++i) {{
@@ -116,7 +117,7 @@ _TILE = f"""
     // Factors of the chain rule that all lanes share: exp2 and squares, see below.
     const float s = {2 * LN2!r}f;
     const F factors = {{s, s, s, s, s, s, s, s, 1, 1, 1, 1, s, s, s, s}};
-    for (int at = begin; at < end;) {{
+    for (int at = begin; at < end && alive;) {{
         int masks[{BATCH_SIZE}] __attribute__((aligned(64)));
 {_BATCH}
         for (int i = 0; i < held; ++i) {{
@@ -129,15 +130,20 @@ _TILE = f"""
                 const int k = __builtin_ctz(mask);
                 mask &= mask - 1;
                 const F x = X[k], y = Y[k];
-                F t = T[k];
-{POWER}{EXP2}{BLEND}
+                const F t = T[k];
+{POWER}{EXP2}
+                const F alpha = raw < alpha_max ? raw : alpha_max;
+                const F next = fma(-alpha, t, t);
+                const I blend = (p >= cutoff) & (next > least[k]);
+                const F w = blend ? alpha * t : zero;
+                T[k] = blend ? next : t;
                 F q = fma((F)r[{CHANNELS}], g0[k], fma((F)r[{CHANNELS + 1}], g1[k],
                     r[{CHANNELS + 2}] * g2[k]));
                 if (count > 3) q = fma((F)r[{CHANNELS + 3}], g3[k], q);
                 const F behind = fma(-w, q, R[k]);
                 R[k] = behind;
-                const F g_alpha = fma(t, q, -behind / (one - alpha));
-                const F g_p = (blend & (raw <= alpha_max)) ? g_alpha * raw : zero;
+                // alpha times the gradient at alpha, with T (1 - alpha) = next.
+                const F g_p = (blend & (raw <= alpha_max)) ? w * (q - behind / next) : zero;
                 const F g_u = g_p * u, g_v = g_p * v;
                 sum_p += g_p;
                 sum_u += g_u;
@@ -153,9 +159,6 @@ _TILE = f"""
                     abs_x += __builtin_elementwise_abs(a * g_u);
                     abs_y += __builtin_elementwise_abs(fma((F)b, g_u, d * g_v));
                 }}
-{PASS}
-                T[k] = t;
-                if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
             }} while (mask);
 {SPILL}
             // p = l - u^2 - v^2, u = a dx + b dy, v = d dy, with dx, dy from the mean: X, Y plus those of
@@ -175,6 +178,10 @@ _TILE = f"""
             __builtin_memcpy(out, &total, 64);
         }}
         at += held;
+        for (unsigned blocks = alive; blocks; blocks &= blocks - 1) {{
+            const int k = __builtin_ctz(blocks);
+            if (!bits(0.999f * T[k] > left[k])) alive &= ~(1u << k);
+        }}
     }}
 #endif
 """
