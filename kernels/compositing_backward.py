@@ -37,9 +37,8 @@ from gdpro_sim.kernels.projection import (
     LOG2_OPACITY,
     MEAN,
     RECORD,
-    vec4s,
 )
-from gdpro_sim.kernels.slabs import IN_SLAB
+from gdpro_sim.kernels.slabs import SLAB_ROWS
 
 wp.set_module_options(
     {
@@ -52,7 +51,7 @@ wp.set_module_options(
 
 SPILL = """
         float* out;
-        if (whole || in_slab((int)g)) {
+        if (own >> i & 1) {
             out = sums_out.data + g * WIDTH;
         } else {
             spill_ids_out.data[spill] = (int)g;
@@ -61,25 +60,27 @@ SPILL = """
             ++spill;
         }
 """
-"""CPU snippet: Gaussian `g` -> where its sums of this tile go (see `gdpro_sim.kernels.slabs`)."""
+"""CPU snippet: entry i of the batch, Gaussian `g` -> where its sums of this tile go: to the result where its bit
+of `own` is set, that is where it touches tiles of the slab alone (see `gdpro_sim.kernels.slabs`)."""
 
 _BATCH = (
     BATCH.replace("{declare}", "I reached = (I)0;")
     .replace("{each}", "reached |= hit & (1 << k);")
     .replace(
         "{end}",
-        """*(I*)(masks + first) = reached;
-            for (int j = 0; j < 16 && first + j < held; ++j) {
+        f"""*(I*)(masks + first) = reached;
+            own |= bits((fields[{MEAN + 1}] - fields[{BOX + 1}] >= slab_top)
+                & (fields[{MEAN + 1}] + fields[{BOX + 1}] <= slab_bottom)) << first;
+            for (int j = 0; j < 16 && first + j < held; ++j) {{
                 __builtin_prefetch(sums_out.data + (size_t)id[at + first + j] * 16, 1);
-            }""",
+            }}""",
     )
 )
 
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{TILE_LANES}{IMAGES}{SUM_LANES}{IN_SLAB}
-    const bool whole = slab_begin == 0 && slab_end == offsets.shape[0] - 1;
-    int spill = whole ? 0 : spill_begins.data[tile];
+{LOCATE_TILE}{TILE_LANES}{IMAGES}{SUM_LANES}{SLAB_ROWS}
+    int spill = spill_begins.shape[0] ? spill_begins.data[tile] : 0;
     F R[16], g0[16], g1[16], g2[16], g3[16];
     F o0[16], o1[16], o2[16], o3[16], on_alpha[16], left[16], least[16];
     F* const gradients[4] = {{g0, g1, g2, g3}};
@@ -119,6 +120,7 @@ _TILE = f"""
     const F factors = {{s, s, s, s, s, s, s, s, 1, 1, 1, 1, s, s, s, s}};
     for (int at = begin; at < end && alive;) {{
         int masks[{BATCH_SIZE}] __attribute__((aligned(64)));
+        unsigned own = 0;
 {_BATCH}
         for (int i = 0; i < held; ++i) {{
             unsigned mask = (unsigned)masks[i] & alive;
@@ -205,7 +207,6 @@ def tile_backward(
     transmittance: wp.array[float],
     g_image: wp.array2d[float],
     g_alphas: wp.array[float],
-    rects: wp.array[vec4s],
     slab_begin: int,
     slab_end: int,
     spill_begins: wp.array[int],
@@ -234,7 +235,6 @@ def composite_tile_backward(
     transmittance: wp.array[float],
     g_image: wp.array2d[float],
     g_alphas: wp.array[float],
-    rects: wp.array[vec4s],
     slab_begin: int,
     slab_end: int,
     spill_begins: wp.array[int],
@@ -264,7 +264,6 @@ def composite_tile_backward(
         transmittance,
         g_image,
         g_alphas,
-        rects,
         slab_begin,
         slab_end,
         spill_begins,

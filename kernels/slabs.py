@@ -8,6 +8,8 @@ each Gaussian's sum is taken over its tiles in ascending order, whatever the sla
 
 import warp as wp
 
+from gdpro_sim.kernels.projection import TILE
+
 wp.set_module_options(
     {
         "enable_backward": False,
@@ -17,15 +19,15 @@ wp.set_module_options(
     }
 )
 
-IN_SLAB = """
-    auto in_slab = [&](int g) {
-        const short* const r = (const short*)(rects.data + g);
-        const int first_tile = (camera * tiles_y + r[1]) * tiles_x + r[0];
-        const int last_tile = (camera * tiles_y + r[3] - 1) * tiles_x + r[2] - 1;
-        return first_tile >= slab_begin && last_tile < slab_end;
-    };
+SLAB_ROWS = f"""
+    // Gaussians within these rows of pixels touch tiles of the slab alone; a pixel to spare for rounding.
+    const int slab_row = (slab_begin + tiles_x - 1) / tiles_x - camera * tiles_y;
+    const int slab_row_end = slab_end / tiles_x - camera * tiles_y;
+    const float slab_top = slab_row <= 0 ? -1.0e30f : (float)({TILE} * slab_row + 1);
+    const float slab_bottom = slab_row_end >= tiles_y ? 1.0e30f : (float)({TILE} * slab_row_end - 1);
 """
-"""Snippet: whether a Gaussian touches tiles of the slab alone."""
+"""Snippet, after LOCATE_TILE of `gdpro_sim.kernels.compositing`: slab_begin, slab_end -> slab_top, slab_bottom.
+"""
 
 
 @wp.func_native("""

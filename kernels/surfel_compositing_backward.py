@@ -19,8 +19,7 @@ from gdpro_sim.kernels.compositing import BATCH_SIZE, EXP2, LN2, LOCATE_PIXEL, L
 from gdpro_sim.kernels.compositing_backward import SPILL, WARP_SUMS
 from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
-from gdpro_sim.kernels.projection import vec4s
-from gdpro_sim.kernels.slabs import IN_SLAB
+from gdpro_sim.kernels.slabs import SLAB_ROWS
 from gdpro_sim.kernels.surfel_compositing import (
     BATCH,
     BATCH_STATE,
@@ -36,6 +35,7 @@ from gdpro_sim.kernels.surfel_compositing import (
 )
 from gdpro_sim.kernels.surfels import (
     BLUR,
+    BOX,
     CENTER,
     CHANNELS,
     DEPTH,
@@ -193,6 +193,8 @@ _BATCH = (
         "{end}",
         f"""*(I*)(masks + first) = reached;
             *(I*)(blurs + first) = softened;
+            own |= bits((fields[{BOX + 1}] - fields[{BOX + 3}] >= slab_top)
+                & (fields[{BOX + 1}] + fields[{BOX + 3}] <= slab_bottom)) << first;
             for (int j = 0; j < 16 && first + j < held; ++j) {{
                 const float* const sum = sums_out.data + (size_t)id[at + first + j] * {RECORD};
                 __builtin_prefetch(sum, 1);
@@ -203,7 +205,7 @@ _BATCH = (
 
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{VECTOR}{IMAGES}{SUM_LANES}{IN_SLAB}{BATCH_STATE}
+{LOCATE_TILE}{VECTOR}{IMAGES}{SUM_LANES}{SLAB_ROWS}{BATCH_STATE}
     const int channels_out = image.shape[1];
 {_STATE}
     // R starts as the sum of all images times their gradients, as in the text for one pixel below. An
@@ -260,13 +262,13 @@ _TILE = f"""
         }}
     }}
 
-    const bool whole = slab_begin == 0 && slab_end == offsets.shape[0] - 1;
-    int spill = whole ? 0 : spill_begins.data[tile];
+    int spill = spill_begins.shape[0] ? spill_begins.data[tile] : 0;
     const int end = stops.data[tile];
     const int WIDTH = {RECORD};
     for (int at = begin; at < end;) {{
         int masks[{BATCH_SIZE}] __attribute__((aligned(64))),
             blurs[{BATCH_SIZE}] __attribute__((aligned(64)));
+        unsigned own = 0;
 {_BATCH}
         for (int i = 0; i < held; ++i) {{
             const int number = at + i;
@@ -351,7 +353,6 @@ def tile_backward(
     g_normals: wp.array2d[float],
     g_distortion: wp.array[float],
     g_medians: wp.array[float],
-    rects: wp.array[vec4s],
     slab_begin: int,
     slab_end: int,
     spill_begins: wp.array[int],
@@ -388,7 +389,6 @@ def surfel_tile_backward(
     g_normals: wp.array2d[float],
     g_distortion: wp.array[float],
     g_medians: wp.array[float],
-    rects: wp.array[vec4s],
     slab_begin: int,
     slab_end: int,
     spill_begins: wp.array[int],
@@ -426,7 +426,6 @@ def surfel_tile_backward(
         g_normals,
         g_distortion,
         g_medians,
-        rects,
         slab_begin,
         slab_end,
         spill_begins,

@@ -111,7 +111,6 @@ def blend(
         projection.means2d,
         channels,
         backgrounds.contiguous(),
-        projection.rects,
         lists,
         blending,
     )
@@ -128,7 +127,6 @@ class _Blend(torch.autograd.Function):
         means2d: torch.Tensor,
         channels: torch.Tensor | None,
         backgrounds: torch.Tensor,
-        rects: torch.Tensor,
         lists: TileLists,
         blending: Blending,
     ) -> tuple[torch.Tensor, ...]:
@@ -159,7 +157,7 @@ class _Blend(torch.autograd.Function):
         else:
             count = tiles * int(TILE) ** 2
             launch_chunked(kernels.composite_pixel, count, inputs, outputs, device=device_name(image))
-        ctx.save_for_backward(records, means2d, channels, rects, image, transmittance, stops)
+        ctx.save_for_backward(records, means2d, channels, image, transmittance, stops)
         ctx.lists, ctx.blending, ctx.cameras = lists, blending, len(backgrounds)
         ctx.mark_non_differentiable(transmittance, stops)
         ctx.set_materialize_grads(False)
@@ -170,7 +168,7 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         g_image, g_alphas = gradients[:2]
         if g_image is None and g_alphas is None:
-            return (None,) * 7
+            return (None,) * 6
         with beside_torch(ctx.saved_tensors[0]):
             return _blend_backward(ctx, g_image, g_alphas)
 
@@ -178,7 +176,7 @@ class _Blend(torch.autograd.Function):
 def _blend_backward(
     ctx: Any, g_image: torch.Tensor | None, g_alphas: torch.Tensor | None
 ) -> tuple[torch.Tensor | None, ...]:
-    records, means2d, channels, rects, image, transmittance, stops = ctx.saved_tensors
+    records, means2d, channels, image, transmittance, stops = ctx.saved_tensors
     g_image = torch.zeros_like(image) if g_image is None else g_image.contiguous()
     g_alphas = image.new_empty(0) if g_alphas is None else g_alphas.contiguous()
     blending: Blending = ctx.blending
@@ -190,9 +188,9 @@ def _blend_backward(
         if blending.divided >= 0:
             g_backgrounds[:, blending.divided] = 0.0
     if len(records) == 0:
-        return torch.zeros_like(records), torch.zeros_like(means2d), None, g_backgrounds, None, None, None
+        return torch.zeros_like(records), torch.zeros_like(means2d), None, g_backgrounds, None, None
     sums = gradient_sums(
-        records, channels, ctx.lists, rects, stops, image, transmittance, g_image, g_alphas, blending
+        records, channels, ctx.lists, stops, image, transmittance, g_image, g_alphas, blending
     )
     if blending.absgrad:
         total = sums[:, BOX : BOX + 2].view_as(means2d).clone()
@@ -203,14 +201,13 @@ def _blend_backward(
     if channels is not None:
         g_channels = sums[:, CHANNELS : CHANNELS + GROUP].clone()
         sums[:, CHANNELS : CHANNELS + GROUP] = 0.0
-    return sums, g_means2d, g_channels, g_backgrounds, None, None, None
+    return sums, g_means2d, g_channels, g_backgrounds, None, None
 
 
 def gradient_sums(
     records: torch.Tensor,
     channels: torch.Tensor | None,
     lists: TileLists,
-    rects: torch.Tensor,
     stops: torch.Tensor,
     image: torch.Tensor,
     transmittance: torch.Tensor,
@@ -239,9 +236,8 @@ def gradient_sums(
             inputs,
             lists,
             stops,
-            rects,
             view.tiles[0],
-            int(RECORD),
+            (len(records), int(RECORD)),
         )
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.
@@ -266,7 +262,6 @@ def weigh(
         projection.records.detach(),
         None,
         lists,
-        projection.rects,
         result.stops,
         torch.zeros_like(values),
         result.transmittance.reshape(-1),

@@ -9,7 +9,6 @@ import warp as wp
 
 from gdpro_sim.device import PIECES, launch_ranges, thread_count
 from gdpro_sim.kernels import slabs as kernels
-from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.projection import array
 from gdpro_sim.splatting.tiles import TileLists
@@ -49,38 +48,37 @@ def add_over_tiles(
     inputs: list[Any],
     lists: TileLists,
     stops: torch.Tensor,
-    rects: torch.Tensor,
     columns: int,
-    width: int,
+    shape: tuple[int, int],
 ) -> torch.Tensor:
-    """Sums [M, width] float32 of what the tiles add to each of M Gaussians.
+    """Sums float32 of `shape`, M and width, of what the tiles add to each of M Gaussians.
 
-    `kernel` runs on a CPU once per tile, with the arguments: first tile of the launch, `inputs`, rects, first
+    `kernel` runs on a CPU once per tile, with the arguments: first tile of the launch, `inputs`, first
     and end tile of the slab, where each tile's spills begin [tiles + 1], sums [M, width], spill ids [E] and
     spills [E, width]. It must add to the sums where the Gaussian touches tiles of the slab alone, and else
     write the next of its tile's spills; it may leave out what adds nothing. `columns` tiles make a row.
     """
     tiles = len(lists.offsets) - 1
-    rects_array = array(rects, vec4s)
-    sums = buffers.empty((len(rects), width), torch.float32, rects.device).zero_()
+    width, device = shape[1], stops.device
+    sums = buffers.empty(shape, torch.float32, device).zero_()
     sums_array = array(sums, wp.float32)
     slabs = max(1, min(thread_count(), tiles, int(tiles / (SMALLEST_SLAB * columns))))
     if slabs == 1:
         none = torch.empty(0, dtype=torch.int32)
         spills = torch.empty(0, width)
         arguments = [array(none, wp.int32), sums_array, array(none, wp.int32), array(spills, wp.float32)]
-        wp.launch(kernel, dim=tiles, inputs=[0, *inputs, rects_array, 0, tiles, *arguments], device="cpu")
+        wp.launch(kernel, dim=tiles, inputs=[0, *inputs, 0, tiles, *arguments], device="cpu")
         return sums
     bounds = balanced_slabs(lists.offsets[:-1], stops, slabs)
     # A tile spills no more than its entries, so its spills have place at their numbers. Most of this
     # memory is never touched.
     entries = len(lists.ids)
-    spill_ids = buffers.empty((entries,), torch.int32, rects.device).fill_(-1)
-    spills = buffers.empty((entries, width), torch.float32, rects.device)
+    spill_ids = buffers.empty((entries,), torch.int32, device).fill_(-1)
+    spills = buffers.empty((entries, width), torch.float32, device)
     spills_array = [array(spill_ids, wp.int32), array(spills, wp.float32)]
     arguments = [array(lists.offsets, wp.int32), sums_array, *spills_array]
 
-    whole = [*inputs, rects_array, 0, tiles, *arguments]
+    whole = [*inputs, 0, tiles, *arguments]
     launch_ranges(kernel, bounds, whole, {"slab_begin": bounds[:-1], "slab_end": bounds[1:]})
     parts = slabs if entries >= SMALLEST_MERGE else 1
     spilled = [parts, array(lists.offsets, wp.int32), *spills_array, sums_array]

@@ -92,7 +92,6 @@ def composite_surfels(
         projection.means2d,
         None,
         backgrounds[:, :colours].contiguous(),
-        projection.rects,
         lists,
         blending,
     )
@@ -107,9 +106,7 @@ def composite_surfels(
                 packed = packed.repeat(projection.cameras, 1)
             packed = torch.nn.functional.pad(packed, (0, GROUP - packed.shape[1]))
             more = SurfelBlending(view, background.shape[1], False, False, False, tile, absgrad)
-            results = _Blend.apply(
-                projection.records, projection.means2d, packed, background, projection.rects, lists, more
-            )
+            results = _Blend.apply(projection.records, projection.means2d, packed, background, lists, more)
             parts.append(results[0].view(*size, background.shape[1]))
         image = torch.cat([*parts, image[..., GROUP:]], dim=-1)
     return SurfelComposite(
@@ -132,7 +129,6 @@ class _Blend(torch.autograd.Function):
         means2d: torch.Tensor,
         channels: torch.Tensor | None,
         backgrounds: torch.Tensor,
-        rects: torch.Tensor,
         lists: TileLists,
         blending: SurfelBlending,
     ) -> tuple[torch.Tensor, ...]:
@@ -178,7 +174,6 @@ class _Blend(torch.autograd.Function):
             records,
             means2d,
             channels,
-            rects,
             stops,
             image,
             transmittance,
@@ -196,9 +191,9 @@ class _Blend(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         given = gradients[:5]
-        records, means2d, channels, rects, stops, *images = ctx.saved_tensors
+        records, means2d, channels, stops, *images = ctx.saved_tensors
         if all(gradient is None for gradient in given):
-            return (None,) * 7
+            return (None,) * 6
         image = images[0]
         g_image = torch.zeros_like(image) if given[0] is None else given[0].contiguous()
         nothing = image.new_empty(0)
@@ -209,7 +204,7 @@ class _Blend(torch.autograd.Function):
         geometry = blending.depth or any(gradient is not None for gradient in given[2:])
         with beside_torch(records):
             sums = gradient_sums(
-                records, channels, ctx.lists, rects, stops, images, [g_image, *rest], blending, geometry
+                records, channels, ctx.lists, stops, images, [g_image, *rest], blending, geometry
             )
         if blending.absgrad:
             total = sums[:, list(ABSOLUTE)].view_as(means2d)
@@ -228,14 +223,13 @@ class _Blend(torch.autograd.Function):
                     ctx.cameras, pixels, image.shape[1]
                 )
                 g_backgrounds = covered[..., : blending.colours].double().sum(1).float()
-        return sums, g_means2d, g_channels, g_backgrounds, None, None, None
+        return sums, g_means2d, g_channels, g_backgrounds, None, None
 
 
 def gradient_sums(
     records: torch.Tensor,
     channels: torch.Tensor | None,
     lists: TileLists,
-    rects: torch.Tensor,
     stops: torch.Tensor,
     images: list[torch.Tensor],
     gradients: list[torch.Tensor],
@@ -269,9 +263,8 @@ def gradient_sums(
             inputs,
             lists,
             stops,
-            rects,
             view.tiles[0],
-            RECORD,
+            (len(records), RECORD),
         )
     sums = torch.zeros_like(records)
     # One launch: pixels add to the same memory, with atomics on a GPU and in turn on a CPU.
@@ -310,7 +303,6 @@ def weigh_surfels(
             records,
             None,
             lists,
-            projection.rects,
             result.stops,
             images,
             [values, nothing, none, nothing, nothing],
