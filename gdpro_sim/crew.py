@@ -6,6 +6,7 @@ a little, spinning, before it sleeps: launches that follow each other closely fi
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import queue
 import threading
@@ -13,7 +14,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from gdpro_sim.kernels import threads as kernels
@@ -25,12 +25,72 @@ NAP = 2.0e-5
 """Seconds between looks at pieces that other threads hold for longer than that."""
 
 
+class Signature:
+    """How a compiled kernel is called on a CPU: with launch bounds and a structure of its arguments.
+
+    names: of the arguments, the first of which is `start`
+    kind:  the structure
+    """
+
+    def __init__(self, recorded: wp.Launch) -> None:
+        _, *params = recorded.params
+        self.names = [argument.label for argument in recorded.kernel.adj.args]
+        fields = [(name, type(param)) for name, param in zip(self.names, params, strict=True)]
+        self.kind: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        self.call = recorded.hooks.forward
+        self.address = ctypes.cast(self.call, ctypes.c_void_p).value or 0
+        # Without the arguments, whose memory would be kept.
+        self._recorded = copy.copy(recorded)
+        self._recorded.params, self._recorded.fwd_args = recorded.params[:1], None
+        self._bounds: dict[tuple[int, ...], Any] = {}
+
+    def bounds(self, counts: tuple[int, ...]) -> Any:
+        """Launch bounds over each of these numbers of indices, side by side in memory."""
+        found = self._bounds.get(counts)
+        if found is None:
+            if len(self._bounds) >= MAX_BOUNDS:
+                self._bounds.clear()
+            found = (type(self._recorded.params[0]) * len(counts))()
+            for i, count in enumerate(counts):
+                self._recorded.set_dim(count)
+                found[i] = self._recorded.params[0]
+            self._bounds[counts] = found
+        return found
+
+
+MAX_BOUNDS = 256
+"""Divisions into ranges that a signature remembers before it forgets them all."""
+
+_signatures: dict[wp.Kernel, Signature] = {}
+
+
+def signature_of(kernel: wp.Kernel, inputs: list[Any]) -> Signature:
+    """The signature of a kernel for a CPU. `inputs` are arguments of the right kinds."""
+    known = _signatures.get(kernel)
+    if known is None:
+        recorded = wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True)
+        known = _signatures[kernel] = Signature(recorded)
+    return known
+
+
+class Packed:
+    """Arguments of one launch on a CPU, all of them numbers or arrays' descriptors, without Warp's checks."""
+
+    def __init__(self, signature: Signature, values: Sequence[Any]) -> None:
+        self.signature = signature
+        self.arguments = signature.kind(*values)
+
+    def launch(self, count: int) -> None:
+        """Run over `count` indices on this thread."""
+        bounds = self.signature.bounds((count,))
+        self.signature.call(ctypes.byref(bounds), ctypes.byref(self.arguments))
+
+
 class Command:
     """A recorded launch. On a CPU its arguments lie side by side in memory, as the kernel takes them.
 
     `wp.Launch.launch` puts them there anew at every launch, which takes longer than a small kernel runs.
     numbers:   what the owner last put into it
-    names:     of the kernel's arguments
     arguments: on a CPU, the structure that the kernel takes
     """
 
@@ -40,51 +100,24 @@ class Command:
         if not self._direct:
             return
         bounds, *params = command.params
-        self.names, kind = _layout(command.kernel, params)
-        self.arguments = kind()
-        for name, param in zip(self.names, params, strict=True):
-            setattr(self.arguments, name, param)
-        self._call = command.hooks.forward
+        known = _signatures.get(command.kernel)
+        if known is None:
+            known = _signatures[command.kernel] = Signature(command)
+        self.signature = known
+        self.arguments = known.kind(*params)
         self._where = ctypes.byref(bounds), ctypes.byref(self.arguments)
 
     def put(self, index: int, value: Any) -> None:
         """Give argument number `index` another value."""
         self._command.set_param_at_index(index, value)
         if self._direct:
-            setattr(self.arguments, self.names[index], self._command.params[index + 1])
-
-    def function(self) -> int:
-        """Address of the compiled kernel, on a CPU."""
-        return ctypes.cast(self._call, ctypes.c_void_p).value or 0
-
-    def bounds(self, counts: Sequence[int]) -> Any:
-        """Launch bounds over each of these numbers of indices, on a CPU."""
-        before = self._command.params[0].size
-        found = (type(self._command.params[0]) * len(counts))()
-        for i, count in enumerate(counts):
-            self._command.set_dim(count)
-            found[i] = self._command.params[0]
-        self._command.set_dim(before)
-        return found
+            setattr(self.arguments, self.signature.names[index], self._command.params[index + 1])
 
     def launch(self) -> None:
         if self._direct:
-            self._call(*self._where)
+            self.signature.call(*self._where)
         else:
             self._command.launch()
-
-
-_layouts: dict[wp.Kernel, tuple[list[str], type[ctypes.Structure]]] = {}
-
-
-def _layout(kernel: wp.Kernel, params: Sequence[Any]) -> tuple[list[str], type[ctypes.Structure]]:
-    """Names of a kernel's arguments, and the structure in which it takes them."""
-    known = _layouts.get(kernel)
-    if known is None:
-        names = [argument.label for argument in kernel.adj.args]
-        fields = [(name, type(param)) for name, param in zip(names, params, strict=True)]
-        known = _layouts[kernel] = names, type("Arguments", (ctypes.Structure,), {"_fields_": fields})
-    return known
 
 
 class Plan:
@@ -95,27 +128,20 @@ class Plan:
 
     def __init__(
         self,
-        command: Command,
+        command: Command | Packed,
         ranges: Sequence[tuple[int, int]],
         varying: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
         self.command = command
         self.count = len(ranges)
-        self._arguments = (type(command.arguments) * self.count)()
+        signature = command.signature
+        self._arguments = (signature.kind * self.count)()
         self._varying = dict(varying or {})
-        self._varying[command.names[0]] = [begin for begin, _ in ranges]
-        bounds = command.bounds([end - begin for begin, end in ranges])
-        self._held = (
-            bounds,
-            np.array(
-                [
-                    [ctypes.addressof(each[i]) for i in range(self.count)]
-                    for each in (bounds, self._arguments)
-                ],
-                np.uint64,
-            ),
-        )
-        self.job = command.function(), *(int(row.ctypes.data) for row in self._held[1]), self.count
+        self._varying[signature.names[0]] = [begin for begin, _ in ranges]
+        bounds = signature.bounds(tuple(end - begin for begin, end in ranges))
+        self._held = bounds, _addresses(bounds), _addresses(self._arguments)
+        where = (ctypes.addressof(addresses) for addresses in self._held[1:])
+        self.job = signature.address, *where, self.count
         self.refresh()
 
     def refresh(self) -> None:
@@ -125,6 +151,12 @@ class Plan:
             ctypes.memmove(ctypes.byref(arguments), ctypes.byref(self.command.arguments), size)
             for name, values in self._varying.items():
                 setattr(arguments, name, values[i])
+
+
+def _addresses(items: Any) -> Any:
+    """Where the items of a ctypes array lie."""
+    size, first = ctypes.sizeof(items._type_), ctypes.addressof(items)
+    return (ctypes.c_uint64 * len(items))(*range(first, first + size * len(items), size))
 
 
 class Crew:
@@ -199,4 +231,4 @@ def _rests(seconds: float) -> int:
     return max(1, round(seconds * count / max(time.perf_counter() - begin, 1e-7)))
 
 
-__all__ = ["Command", "Crew", "Plan"]
+__all__ = ["Command", "Crew", "Packed", "Plan", "signature_of"]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from gdpro_sim.crew import Command, Crew, Plan
+from gdpro_sim.crew import Command, Crew, Packed, Plan, signature_of
 from gdpro_sim.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -201,11 +201,25 @@ def launch_ranges(
     if count == 0:
         return
     inputs = [begin, *arguments]
-    if len(bounds) == 2 and not varying:
+    whole = len(bounds) == 2 and not varying
+    if all(isinstance(value, _PLAIN) for value in inputs):
+        packed = Packed(signature_of(kernel, inputs), inputs)
+        if whole:
+            packed.launch(count)
+        else:
+            _crew_of().run(Plan(packed, list(itertools.pairwise(bounds)), varying))
+    elif whole:
         wp.launch(kernel, dim=count, inputs=inputs, device="cpu")
-        return
-    recorded = wp.launch(kernel, dim=count, inputs=inputs, device="cpu", record_cmd=True)
-    _crew_of().run(Plan(Command(recorded, []), list(itertools.pairwise(bounds)), varying))
+    else:
+        recorded = wp.launch(kernel, dim=count, inputs=inputs, device="cpu", record_cmd=True)
+        _crew_of().run(Plan(Command(recorded, []), list(itertools.pairwise(bounds)), varying))
+
+
+DESCRIPTOR: Any = type(wp.zeros(1, dtype=int, device="cpu").__ctype__())
+"""Warp's structure that tells a kernel where an array lies."""
+
+_PLAIN = int, float, DESCRIPTOR
+"""Arguments of a kernel that need no packing."""
 
 
 class Launches:
@@ -272,7 +286,7 @@ class _Recorded:
         self._kernel, self._arguments, self._device = kernel, arguments, device
         self._places = [k for k, argument in enumerate(arguments) if not _is_held(argument)]
         self._commands: dict[tuple[int, int], Command] = {}
-        self._plans: dict[tuple[int, int], Plan] = {}
+        self._plans: dict[tuple[int, int], tuple[Command, Plan]] = {}
 
     def launch(self, begin: int, end: int, numbers: list[Any]) -> None:
         """`numbers` are the arguments that are no arrays or structs, in order."""
@@ -285,13 +299,16 @@ class _Recorded:
 
     def spread(self, count: int, pieces: int, numbers: list[Any]) -> None:
         """Launch over `count` indices in `pieces` ranges, which threads of the CPU take as they come free."""
-        plan = self._plans.get((count, pieces))
-        if plan is None:
+        found = self._plans.get((count, pieces))
+        if found is None:
             bounds = [count * i // pieces for i in range(pieces + 1)]
-            plan = Plan(self._record(0, count, numbers), list(itertools.pairwise(bounds)))
-            self._plans[count, pieces] = plan
-        elif self._renew(plan.command, numbers):
-            plan.refresh()
+            command = self._record(0, count, numbers)
+            plan = Plan(command, list(itertools.pairwise(bounds)))
+            self._plans[count, pieces] = command, plan
+        else:
+            command, plan = found
+            if self._renew(command, numbers):
+                plan.refresh()
         _crew_of().run(plan)
 
     def _record(self, begin: int, end: int, numbers: list[Any]) -> Command:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from gdpro_sim.device import beside_torch, device_name, launch_chunked
+from gdpro_sim.device import DESCRIPTOR, beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import projection as kernels
 from gdpro_sim.kernels import projection_backward
 from gdpro_sim.kernels.projection import vec4s
@@ -90,11 +91,30 @@ class Projection(Projected):
 
 
 def array(tensor: torch.Tensor, dtype: type) -> Any:
-    """The tensor's memory as a kernel argument; trailing axes become a vector or matrix where `dtype` is one.
+    """A contiguous tensor's memory as an argument of a kernel; a vector or matrix `dtype` takes its last axes.
 
-    It keeps the tensor alive.
+    It keeps the tensor alive. `wp.from_torch` does the same in three times the time.
     """
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    scalar, inner, size = _elements(dtype)
+    axes = tensor.ndim - len(inner)
+    shape = tuple(tensor.shape)
+    if tensor.dtype != scalar or shape[axes:] != inner or not tensor.is_contiguous():
+        raise TypeError(f"no array of {dtype.__name__}: {shape} of {tensor.dtype}, strides {tensor.stride()}")
+    shape = shape[:axes] or (1,)
+    strides = [size] * len(shape)
+    for i in range(len(shape) - 2, -1, -1):
+        strides[i] = strides[i + 1] * shape[i + 1]
+    described = DESCRIPTOR(tensor.data_ptr(), 0, len(shape), shape, strides)
+    described._ref = tensor
+    return described
+
+
+@functools.cache
+def _elements(dtype: type) -> tuple[torch.dtype, tuple[int, ...], int]:
+    """Torch's type, inner shape and bytes of a Warp type."""
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+    inner = tuple(getattr(dtype, "_shape_", ()))
+    return wp.dtype_to_torch(scalar), inner, wp.types.type_size_in_bytes(dtype)
 
 
 def lanes_of(tensor: torch.Tensor) -> int:
