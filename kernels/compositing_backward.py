@@ -60,8 +60,8 @@ SPILL = """
             ++spill;
         }
 """
-"""CPU snippet: entry i of the batch, Gaussian `g` -> where its sums of this tile go: to the result where its bit
-of `own` is set, that is where it touches tiles of the slab alone (see `gdpro_sim.kernels.slabs`)."""
+"""CPU snippet: entry i of the batch, Gaussian `g` -> where its sums of this tile go: to the result where its
+bit of `own` is set, that is where it touches tiles of the slab alone (see `gdpro_sim.kernels.slabs`)."""
 
 _BATCH = (
     BATCH.replace("{declare}", "I reached = (I)0;")

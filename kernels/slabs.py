@@ -26,19 +26,23 @@ SLAB_ROWS = f"""
     const float slab_top = slab_row <= 0 ? -1.0e30f : (float)({TILE} * slab_row + 1);
     const float slab_bottom = slab_row_end >= tiles_y ? 1.0e30f : (float)({TILE} * slab_row_end - 1);
 """
-"""Snippet, after LOCATE_TILE of `gdpro_sim.kernels.compositing`: slab_begin, slab_end -> slab_top, slab_bottom.
-"""
+"""Snippet, after LOCATE_TILE of `gdpro_sim.kernels.compositing`: slab_begin, slab_end -> top and bottom."""
 
 
 @wp.func_native("""
+    const int gaussians = sums_out.shape[0];
+    const int begin = (int)((long long)gaussians * part / parts),
+        end = (int)((long long)gaussians * (part + 1) / parts);
     for (int tile = 0; tile + 1 < offsets.shape[0]; ++tile) {
         for (int i = offsets.data[tile]; i < offsets.data[tile + 1]; ++i) {
             const int g = spill_ids.data[i];
             if (g < 0) break;
-            if (g % parts != part) continue;
+            if (g < begin || g >= end) continue;
             float* const sum = sums_out.data + (size_t)g * width;
             const float* const spill = spills.data + (size_t)i * width;
-            for (int j = 0; j < width; ++j) sum[j] += spill[j];
+            for (int j = 0; j < width; j += 8) {
+                for (int k = j; k < j + 8; ++k) sum[k] += spill[k];
+            }
         }
     }
 """)
@@ -64,8 +68,55 @@ def merge_spills(
     # Out:
     sums_out: wp.array2d[float],
 ):
-    """Add the spills, in order, of the Gaussians whose number is `part` modulo `parts`.
+    """Add the spills, in order, of one of `parts` ranges of Gaussians; rows hold 8, 16, 24 .. numbers.
 
     Those of tile t lie from offsets[t] on, with their Gaussians in `spill_ids`, and end before the first -1.
     """
     merge_part(start + wp.tid(), parts, spills.shape[1], offsets, spill_ids, spills, sums_out)
+
+
+CLEARED = 1 << 14
+"""Numbers that one index of `clear` sets to zero."""
+
+
+@wp.func_native(f"""
+    const size_t begin = (size_t)index * {CLEARED}, size = (size_t)sums_out.shape[0] * sums_out.shape[1];
+    const size_t end = begin + {CLEARED} < size ? begin + {CLEARED} : size;
+    for (size_t i = begin; i < end; ++i) sums_out.data[i] = 0.0f;
+""")
+def clear_run(index: int, sums_out: wp.array2d[float]): ...
+
+
+@wp.kernel
+def clear(start: int, sums_out: wp.array2d[float]):
+    """Set sums to zero, `CLEARED` for each index."""
+    clear_run(start + wp.tid(), sums_out)
+
+
+@wp.kernel
+def balance(
+    start: int,
+    # In:
+    begins: wp.array[int],
+    ends: wp.array[int],
+    tile_work: int,
+    # Out:
+    bounds_out: wp.array[int],
+):
+    """Bounds of runs of tiles with about equal work: entries begins[t] .. ends[t] - 1, and `tile_work`.
+
+    One index does it all.
+    """
+    tiles, runs = ends.shape[0], bounds_out.shape[0] - 1
+    total = wp.int64(0)
+    for tile in range(tiles):
+        total += wp.int64(ends[tile] - begins[tile] + tile_work)
+    run = int(0)
+    done = wp.int64(0)
+    for tile in range(tiles):
+        while run < runs and done * wp.int64(runs) >= total * wp.int64(run):
+            bounds_out[run] = tile
+            run += 1
+        done += wp.int64(ends[tile] - begins[tile] + tile_work)
+    for later in range(run, runs + 1):
+        bounds_out[start + wp.tid() + later] = tiles

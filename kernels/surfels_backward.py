@@ -48,8 +48,10 @@ _BACKWARD = f"""
         load_rows(g_records.data + first * {RECORD} + {RECORD - 16}, {RECORD}, g + {RECORD - 16});
         load_rows(g_records.data + first * {RECORD}, {RECORD}, g);
         for (int i = 0; i < {RECORD}; ++i) g[i] = select(shown, g[i], zero);
-        const F g_mean_x = select(shown, load(g_means2d.data + 2 * first, 2), zero);
-        const F g_mean_y = select(shown, load(g_means2d.data + 2 * first + 1, 2), zero);
+        const int mean_stride = g_means2d.strides[0] / (int)sizeof(float);
+        const float* const g_mean = g_means2d.data + first * mean_stride;
+        const F g_mean_x = select(shown, load(g_mean, mean_stride), zero);
+        const F g_mean_y = select(shown, load(g_mean + 1, mean_stride), zero);
         F gx = zero, gy = zero, gz = g[{DEPTH}];
         F gr00 = zero, gr01 = zero, gr02 = zero, gr10 = zero, gr11 = zero, gr12 = zero, gr20 = zero,
             gr21 = zero,

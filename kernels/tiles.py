@@ -34,7 +34,7 @@ def first_tile(rect: vec4s, camera: int, tiles_x: int, tiles_y: int) -> int:
 
 
 _EACH = """
-    const int count = order.shape[1] / 2, cameras = order.shape[0];
+    const int cameras = order.shape[0], count = rects.shape[0] / cameras;
     const int begin = (int)((long long)count * part / parts),
         end = (int)((long long)count * (part + 1) / parts);
     int* const counts = counts_out.data + (size_t)part * counts_out.shape[1];

@@ -14,7 +14,7 @@ import warp as wp
 
 from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import diffusion as kernels
-from gdpro_sim.splatting.projection import array
+from gdpro_sim.splatting.arrays import array
 
 STEPS = 1000
 """Steps of the noise schedule."""

@@ -14,7 +14,8 @@ from gdpro_sim.kernels import compositing as kernels
 from gdpro_sim.kernels import compositing_backward
 from gdpro_sim.kernels.projection import BOX, CHANNELS, MEAN, RECORD, TILE
 from gdpro_sim.splatting import buffers
-from gdpro_sim.splatting.projection import Projection, View, array
+from gdpro_sim.splatting.arrays import array
+from gdpro_sim.splatting.projection import Projection, View
 from gdpro_sim.splatting.slabs import add_over_tiles, launch_tiles
 from gdpro_sim.splatting.tiles import TileLists
 

@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import depth as kernels
 from gdpro_sim.splatting import buffers
+from gdpro_sim.splatting.arrays import array
 from gdpro_sim.splatting.images import check_alike, check_images
-from gdpro_sim.splatting.projection import array
 
 
 def depth_to_normals(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +9,13 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from gdpro_sim.device import DESCRIPTOR, beside_torch, device_name, launch_chunked
+from gdpro_sim.device import beside_torch, device_name, launch_chunked
 from gdpro_sim.kernels import projection as kernels
 from gdpro_sim.kernels import projection_backward
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting import buffers
+from gdpro_sim.splatting.arrays import array
+from gdpro_sim.splatting.sorting import keys_and_order, sort_by_depth
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Projected:
     means2d: [C, N, 2] pixels
     radii:   [M, 2] int32, half extents in pixels of the box outside which alpha < 1/255; zeros where culled
     rects:   [M, 4] int16, tiles touched: x begin, y begin, x end, y end (exclusive); zeros where culled
-    order:   [C, 2 N] int32, of which order[:, :N] are record numbers in ascending depth, culled ones last;
-             None once the tile lists are made
+    order:   [C, N or more] int32, of which order[:, :N] are record numbers in ascending depth, culled ones
+             last; None once the tile lists are made
     """
 
     records: torch.Tensor
@@ -90,43 +91,9 @@ class Projection(Projected):
         return torch.stack([a * a, a * b, b * b + d * d], dim=-1) / kernels.HALF_LOG2_E
 
 
-def array(tensor: torch.Tensor, dtype: type) -> Any:
-    """A contiguous tensor's memory as an argument of a kernel; a vector or matrix `dtype` takes its last axes.
-
-    It keeps the tensor alive. `wp.from_torch` does the same in three times the time.
-    """
-    scalar, inner, size = _elements(dtype)
-    axes = tensor.ndim - len(inner)
-    shape = tuple(tensor.shape)
-    if tensor.dtype != scalar or shape[axes:] != inner or not tensor.is_contiguous():
-        raise TypeError(f"no array of {dtype.__name__}: {shape} of {tensor.dtype}, strides {tensor.stride()}")
-    shape = shape[:axes] or (1,)
-    strides = [size] * len(shape)
-    for i in range(len(shape) - 2, -1, -1):
-        strides[i] = strides[i + 1] * shape[i + 1]
-    described = DESCRIPTOR(tensor.data_ptr(), 0, len(shape), shape, strides)
-    described._ref = tensor
-    return described
-
-
-@functools.cache
-def _elements(dtype: type) -> tuple[torch.dtype, tuple[int, ...], int]:
-    """Torch's type, inner shape and bytes of a Warp type."""
-    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
-    inner = tuple(getattr(dtype, "_shape_", ()))
-    return wp.dtype_to_torch(scalar), inner, wp.types.type_size_in_bytes(dtype)
-
-
 def lanes_of(tensor: torch.Tensor) -> int:
     """How many Gaussians a kernel works on at once, see `gdpro_sim.kernels.lanes`."""
     return 16 if tensor.device.type == "cpu" else 1
-
-
-def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int = 32) -> None:
-    """Sort `values` [2 count] with their `keys` [2 count] by the keys' lowest `bits`; stable, in place."""
-    keys_array: Any = wp.from_torch(keys)
-    values_array: Any = wp.from_torch(values)
-    wp.utils.radix_sort_pairs(keys_array, values_array, count, end_bit=bits)
 
 
 def project(
@@ -167,8 +134,7 @@ class _Project(torch.autograd.Function):
         means2d = buffers.empty((cameras, count, 2), means.dtype, means.device)
         radii = buffers.empty((total, 2), torch.int32, means.device)
         rects = buffers.empty((total, 4), torch.int16, means.device)
-        keys = torch.empty((cameras, 2 * count), device=means.device)
-        order = torch.empty((cameras, 2 * count), dtype=torch.int32, device=means.device)
+        keys, order = keys_and_order(cameras, count, means.device)
         lanes = lanes_of(means)
         launch_chunked(
             kernels.project,
@@ -203,8 +169,7 @@ class _Project(torch.autograd.Function):
             device=device_name(means),
             minimum=256,
         )
-        for camera in range(cameras if count > 0 else 0):
-            sort_pairs(keys[camera], order[camera], count)
+        sort_by_depth(keys, order, count)
         ctx.save_for_backward(means, quats, scales, opacities, sh, features, viewmats, Ks, rects)
         ctx.degree, ctx.view = degree, view
         ctx.mark_non_differentiable(radii, rects, order)
@@ -276,7 +241,7 @@ def backward_of_projection(
                 with_cameras,
                 array(rects, vec4s),
                 array(g_records.contiguous(), wp.float32),
-                array(g_means2d.reshape(total, 2).contiguous(), wp.float32),
+                array(g_means2d.reshape(total, 2), wp.float32),
             ],
             [
                 array(g_means, wp.vec3),
@@ -314,9 +279,7 @@ __all__ = [
     "Projected",
     "Projection",
     "View",
-    "array",
     "backward_of_projection",
     "lanes_of",
     "project",
-    "sort_pairs",
 ]

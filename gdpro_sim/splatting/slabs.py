@@ -7,10 +7,10 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import PIECES, launch_ranges, thread_count
+from gdpro_sim.device import PIECES, launch_chunked, launch_ranges, thread_count
 from gdpro_sim.kernels import slabs as kernels
 from gdpro_sim.splatting import buffers
-from gdpro_sim.splatting.projection import array
+from gdpro_sim.splatting.arrays import array
 from gdpro_sim.splatting.tiles import TileLists
 
 TILE_WORK = 32
@@ -22,16 +22,22 @@ SMALLEST_PIECE = 32
 SMALLEST_SLAB = 4
 """Rows of tiles worth a slab: in fewer nearly every Gaussian would touch another slab, and be spilled."""
 
+SLABS = 1
+"""Slabs for each thread."""
+
+SMALLEST_CLEARED = 8
+"""Runs of zeros worth a piece of their own."""
+
 SMALLEST_MERGE = 1 << 15
 """Entries whose spills are worth merging on several threads."""
 
 
 def balanced_slabs(begins: torch.Tensor, ends: torch.Tensor, slabs: int) -> list[int]:
     """Bounds [slabs + 1] of runs of tiles with about equally many entries, begins[t] .. ends[t] - 1."""
-    tiles = len(begins)
-    work = torch.cumsum(ends.to(torch.int64) - begins + TILE_WORK, 0)
-    shares = torch.arange(1, slabs) * int(work[-1]) // slabs
-    return [0, *torch.searchsorted(work, shares).tolist(), tiles]
+    bounds = torch.empty(slabs + 1, dtype=torch.int32)
+    arrays = [array(each, wp.int32) for each in (begins, ends)]
+    launch_ranges(kernels.balance, [0, 1], [*arrays, TILE_WORK, array(bounds, wp.int32)])
+    return bounds.tolist()
 
 
 def launch_tiles(kernel: wp.Kernel, offsets: torch.Tensor, arguments: list[Any]) -> None:
@@ -60,14 +66,17 @@ def add_over_tiles(
     """
     tiles = len(lists.offsets) - 1
     width, device = shape[1], stops.device
-    sums = buffers.empty(shape, torch.float32, device).zero_()
+    sums = buffers.empty(shape, torch.float32, device)
     sums_array = array(sums, wp.float32)
-    slabs = max(1, min(thread_count(), tiles, int(tiles / (SMALLEST_SLAB * columns))))
+    cleared = -(-sums.numel() // kernels.CLEARED)
+    launch_chunked(kernels.clear, cleared, [], [sums_array], device="cpu", minimum=SMALLEST_CLEARED)
+    slabs = 1 if thread_count() == 1 else min(SLABS * thread_count(), tiles // (SMALLEST_SLAB * columns))
+    slabs = max(1, slabs)
     if slabs == 1:
         none = torch.empty(0, dtype=torch.int32)
         spills = torch.empty(0, width)
         arguments = [array(none, wp.int32), sums_array, array(none, wp.int32), array(spills, wp.float32)]
-        wp.launch(kernel, dim=tiles, inputs=[0, *inputs, 0, tiles, *arguments], device="cpu")
+        launch_ranges(kernel, [0, tiles], [*inputs, 0, tiles, *arguments])
         return sums
     bounds = balanced_slabs(lists.offsets[:-1], stops, slabs)
     # A tile spills no more than its entries, so its spills have place at their numbers. Most of this
@@ -80,7 +89,7 @@ def add_over_tiles(
 
     whole = [*inputs, 0, tiles, *arguments]
     launch_ranges(kernel, bounds, whole, {"slab_begin": bounds[:-1], "slab_end": bounds[1:]})
-    parts = slabs if entries >= SMALLEST_MERGE else 1
+    parts = thread_count() if entries >= SMALLEST_MERGE else 1
     spilled = [parts, array(lists.offsets, wp.int32), *spills_array, sums_array]
     launch_ranges(kernels.merge_spills, range(parts + 1), spilled)
     return sums

@@ -16,7 +16,8 @@ from gdpro_sim.kernels.projection import TILE
 from gdpro_sim.kernels.surfel_compositing_backward import ABSOLUTE
 from gdpro_sim.kernels.surfels import CHANNELS, MEAN, RECORD
 from gdpro_sim.splatting import buffers
-from gdpro_sim.splatting.projection import View, array
+from gdpro_sim.splatting.arrays import array
+from gdpro_sim.splatting.projection import View
 from gdpro_sim.splatting.slabs import add_over_tiles, launch_tiles
 from gdpro_sim.splatting.surfel_projection import SurfelProjection
 from gdpro_sim.splatting.tiles import TileLists

@@ -14,14 +14,14 @@ from gdpro_sim.kernels import surfels as kernels
 from gdpro_sim.kernels import surfels_backward
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting import buffers
+from gdpro_sim.splatting.arrays import array
 from gdpro_sim.splatting.projection import (
     Projected,
     View,
-    array,
     backward_of_projection,
     lanes_of,
-    sort_pairs,
 )
+from gdpro_sim.splatting.sorting import keys_and_order, sort_by_depth
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,7 @@ class _Project(torch.autograd.Function):
         records = buffers.empty((total, kernels.RECORD), means.dtype, means.device)
         radii = buffers.empty((total, 2), torch.int32, means.device)
         rects = buffers.empty((total, 4), torch.int16, means.device)
-        keys = torch.empty((cameras, 2 * count), device=means.device)
-        order = torch.empty((cameras, 2 * count), dtype=torch.int32, device=means.device)
+        keys, order = keys_and_order(cameras, count, means.device)
         lanes = lanes_of(means)
         launch_chunked(
             kernels.project_surfels,
@@ -108,8 +107,7 @@ class _Project(torch.autograd.Function):
             device=device_name(means),
             minimum=256,
         )
-        for camera in range(cameras if count > 0 else 0):
-            sort_pairs(keys[camera], order[camera], count)
+        sort_by_depth(keys, order, count)
         means2d = records.view(cameras, count, kernels.RECORD)[..., :2].contiguous()
         ctx.save_for_backward(means, quats, scales, opacities, sh, features, viewmats, Ks, rects)
         ctx.degree = degree

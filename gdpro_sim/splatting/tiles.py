@@ -11,8 +11,10 @@ from gdpro_sim.device import device_name, launch_chunked, thread_count
 from gdpro_sim.kernels import tiles as kernels
 from gdpro_sim.kernels.projection import vec4s
 from gdpro_sim.splatting import buffers
+from gdpro_sim.splatting.arrays import array
 from gdpro_sim.splatting.checks import INDEX_LIMIT, check_count
-from gdpro_sim.splatting.projection import Projected, View, array, sort_pairs
+from gdpro_sim.splatting.projection import Projected, View
+from gdpro_sim.splatting.sorting import sort_pairs
 
 PART = 4096
 """Fewest Gaussians worth a part (and so a thread) of the counting sort."""

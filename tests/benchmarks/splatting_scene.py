@@ -13,7 +13,7 @@ from gdpro_sim.device import device_name, launch_chunked
 from gdpro_sim.gaussians import rgb_to_sh
 from gdpro_sim.kernels.compositing import ALPHA_MAX, LN2, TRANSMITTANCE_MIN
 from gdpro_sim.kernels.projection import FACTOR, LOG2_CUTOFF, LOG2_OPACITY, MEAN, TILE
-from gdpro_sim.splatting.projection import array
+from gdpro_sim.splatting.arrays import array
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
