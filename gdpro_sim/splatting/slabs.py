@@ -22,9 +22,6 @@ SMALLEST_PIECE = 32
 SMALLEST_SLAB = 4
 """Rows of tiles worth a slab: in fewer nearly every Gaussian would touch another slab, and be spilled."""
 
-SLABS = 1
-"""Slabs for each thread."""
-
 SMALLEST_CLEARED = 8
 """Runs of zeros worth a piece of their own."""
 
@@ -70,8 +67,7 @@ def add_over_tiles(
     sums_array = array(sums, wp.float32)
     cleared = -(-sums.numel() // kernels.CLEARED)
     launch_chunked(kernels.clear, cleared, [], [sums_array], device="cpu", minimum=SMALLEST_CLEARED)
-    slabs = 1 if thread_count() == 1 else min(SLABS * thread_count(), tiles // (SMALLEST_SLAB * columns))
-    slabs = max(1, slabs)
+    slabs = max(1, min(thread_count(), tiles // (SMALLEST_SLAB * columns)))
     if slabs == 1:
         none = torch.empty(0, dtype=torch.int32)
         spills = torch.empty(0, width)
