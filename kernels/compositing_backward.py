@@ -63,6 +63,29 @@ SPILL = """
 """CPU snippet: entry i of the batch, Gaussian `g` -> where its sums of this tile go: to the result where its
 bit of `own` is set, that is where it touches tiles of the slab alone (see `gdpro_sim.kernels.slabs`)."""
 
+AGAIN = f"""
+{EXP2}
+            const F t = T[k];
+            const F alpha = raw < alpha_max ? raw : alpha_max;
+            const F next = fma(-alpha, t, t);
+            const I blend = (p >= cutoff) & (next > least[k]);
+            const F w = blend ? alpha * t : zero;
+            T[k] = blend ? next : t;
+"""
+"""CPU snippet: p, of block k -> raw, alpha, what was in front (t) and will be behind (next), weight w.
+
+Every Gaussian that the forward pass blended left at least the transmittance of the end, and whatever lies
+behind where it stopped would have left at most 254/255 of that: `least` is 0.999 of it.
+"""
+
+STILL_ALIVE = """
+        for (unsigned blocks = alive; blocks; blocks &= blocks - 1) {
+            const int k = __builtin_ctz(blocks);
+            if (!bits(0.998f * T[k] > least[k])) alive &= ~(1u << k);
+        }
+"""
+"""CPU snippet: blocks where all that was blended has been seen are done."""
+
 _BATCH = (
     BATCH.replace("{declare}", "I reached = (I)0;")
     .replace("{each}", "reached |= hit & (1 << k);")
@@ -92,8 +115,6 @@ _TILE = f"""
     read_image(transmittance.data, 1, left_planes);
     if (g_alphas.data) read_image(g_alphas.data, 1, alpha_planes);
     for (int k = 0; k < 16; ++k) {{
-        // What blends leaves no less than what is left in the end, anything behind the stop at least 1/255
-        // less.
         least[k] = 0.999f * left[k];
         if (!g_alphas.data) on_alpha[k] = zero;
         R[k] = zero;
@@ -132,13 +153,7 @@ _TILE = f"""
                 const int k = __builtin_ctz(mask);
                 mask &= mask - 1;
                 const F x = X[k], y = Y[k];
-                const F t = T[k];
-{POWER}{EXP2}
-                const F alpha = raw < alpha_max ? raw : alpha_max;
-                const F next = fma(-alpha, t, t);
-                const I blend = (p >= cutoff) & (next > least[k]);
-                const F w = blend ? alpha * t : zero;
-                T[k] = blend ? next : t;
+{POWER}{AGAIN}
                 F q = fma((F)r[{CHANNELS}], g0[k], fma((F)r[{CHANNELS + 1}], g1[k],
                     r[{CHANNELS + 2}] * g2[k]));
                 if (count > 3) q = fma((F)r[{CHANNELS + 3}], g3[k], q);
@@ -180,10 +195,7 @@ _TILE = f"""
             __builtin_memcpy(out, &total, 64);
         }}
         at += held;
-        for (unsigned blocks = alive; blocks; blocks &= blocks - 1) {{
-            const int k = __builtin_ctz(blocks);
-            if (!bits(0.999f * T[k] > left[k])) alive &= ~(1u << k);
-        }}
+{STILL_ALIVE}
     }}
 #endif
 """

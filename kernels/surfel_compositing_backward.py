@@ -15,8 +15,8 @@ sums over pixels of the absolute gradient at the mean.
 
 import warp as wp
 
-from gdpro_sim.kernels.compositing import BATCH_SIZE, EXP2, LN2, LOCATE_PIXEL, LOCATE_TILE, PASS
-from gdpro_sim.kernels.compositing_backward import SPILL, WARP_SUMS
+from gdpro_sim.kernels.compositing import BATCH_SIZE, LN2, LOCATE_PIXEL, LOCATE_TILE
+from gdpro_sim.kernels.compositing_backward import AGAIN, SPILL, STILL_ALIVE, WARP_SUMS
 from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
 from gdpro_sim.kernels.slabs import SLAB_ROWS
@@ -120,8 +120,9 @@ _GRADIENT = f"""
             }}
             const F behind = fma(-w, q, R[k]);
             R[k] = behind;
-            const F g_alpha = fma(t, q, -behind * reciprocal(one - alpha));
-            const F g_p = (blend & (raw <= alpha_max)) ? g_alpha * ({2 * LN2!r}f * raw) : zero;
+            // alpha times the gradient at alpha, with T (1 - alpha) = next.
+            const F g_log = {2 * LN2!r}f * w * (q - behind * reciprocal(next));
+            const F g_p = (blend & (raw <= alpha_max)) ? g_log : zero;
 """
 """Snippet: weight and depth of block k -> gradient g_z at z and g_p, 2 ln 2 times that at p."""
 
@@ -208,6 +209,7 @@ _TILE = f"""
 {LOCATE_TILE}{VECTOR}{IMAGES}{SUM_LANES}{SLAB_ROWS}{BATCH_STATE}
     const int channels_out = image.shape[1];
 {_STATE}
+    F least[16];
     // R starts as the sum of all images times their gradients, as in the text for one pixel below. An
     // expected
     // depth D / alpha counts as D with a gradient at alpha of its own.
@@ -234,6 +236,7 @@ _TILE = f"""
             }}
             R[k] = fma(-end_[k], on_alpha[k], R[k]);
             T_end[k] = end_[k];
+            least[k] = 0.999f * end_[k];
         }}
         if (g_normals.data) {{
             F* const own_normals[3] = {{h0, h1, h2}};
@@ -265,7 +268,7 @@ _TILE = f"""
     int spill = spill_begins.shape[0] ? spill_begins.data[tile] : 0;
     const int end = stops.data[tile];
     const int WIDTH = {RECORD};
-    for (int at = begin; at < end;) {{
+    for (int at = begin; at < end && alive;) {{
         int masks[{BATCH_SIZE}] __attribute__((aligned(64))),
             blurs[{BATCH_SIZE}] __attribute__((aligned(64)));
         unsigned own = 0;
@@ -282,19 +285,13 @@ _TILE = f"""
                 const int k = __builtin_ctz(mask);
                 mask &= mask - 1;
                 const F x = X[k], y = Y[k], at_x = x, at_y = y;
-                F t = T[k];
-{RAY}{HIT_DISC}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN}{_ADD_DISC}{PASS}
-                T[k] = t;
-                if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
+{RAY}{HIT_DISC}{AGAIN}{_GRADIENT}{_CHAIN}{_ADD_DISC}
             }}
             while (blurred) {{
                 const int k = __builtin_ctz(blurred);
                 blurred &= blurred - 1;
                 const F x = X[k], y = Y[k], at_x = x, at_y = y;
-                F t = T[k];
-{RAY}{LOW}{HIT}{EXP2}{WEIGH}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}{PASS}
-                T[k] = t;
-                if (__builtin_expect(bits(t < 0.0f) == 0xffff, 0)) alive &= ~(1u << k);
+{RAY}{LOW}{HIT}{AGAIN}{_GRADIENT}{_CHAIN_BLUR}{_ADD_BLUR}
             }}
 {SPILL}
             // Offsets e from the centre are X, Y plus those of the tile.
@@ -319,6 +316,7 @@ _TILE = f"""
             for (int j = 0; j < 8; ++j) out[16 + j] += later[j];
         }}
         at += held;
+{STILL_ALIVE}
     }}
 #endif
 """
