@@ -235,6 +235,9 @@ _TILE = f"""
 {BATCH_STATE}
     F c0[16], c1[16], c2[16], c3[16];
     for (int k = 0; k < 16; ++k) c0[k] = c1[k] = c2[k] = c3[k] = zero;
+    fetch_image(image_out.data, count);
+    fetch_image(alphas_out.data, 1);
+    fetch_image(transmittance_out.data, 1);
     const int end = offsets.data[tile + 1];
     int at = begin;
     while (at < end && alive) {{

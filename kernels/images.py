@@ -5,6 +5,7 @@ with n <= 4 interleaved channels
 
     write_image(image, n, planes)   planes[i][k], channel i of the tile's block k, to the image
     read_image(image, n, planes)    the other way; zero outside the image
+    fetch_image(image, n)           brings what will be written to the cache meanwhile
 
 Values travel in vectors and are interleaved by shuffles: lane by lane it would take longer than blending
 does.
@@ -74,6 +75,12 @@ IMAGES = f"""
     const size_t origin = ((size_t)camera * height + tile_y) * width + tile_x;
     auto store_block = [&](float* p, int stride, int n, F v0, F v1, F v2, F v3) {{
         switch (n) {{{_cases({n: _store(n) for n in (1, 2, 3, 4)})}
+        }}
+    }};
+    auto fetch_image = [&](const float* image, int n) {{
+        for (int y = 0; y < y_end; ++y) {{
+            const float* const row = image + (origin + (size_t)y * width) * n;
+            for (int i = 0; i < n; ++i) __builtin_prefetch(row + 16 * i, 1);
         }}
     }};
     auto write_image = [&](float* image, int n, const F* const* planes) {{

@@ -289,23 +289,6 @@ _BATCH = (
     .replace("{end}", "")
 )
 
-_FETCH = """
-    // What is written at the end is on its way to the cache meanwhile.
-    for (int y = 0; y < y_end; ++y) {
-        const size_t row = origin + (size_t)y * width;
-        __builtin_prefetch(alphas_out.data + row, 1);
-        __builtin_prefetch(transmittance_out.data + row, 1);
-        for (int i = 0; i < channels_out; ++i) __builtin_prefetch(image_out.data + row * channels_out
-            + 16 * i, 1);
-        if (!geometry) continue;
-        __builtin_prefetch(depths_out.data + row, 1);
-        __builtin_prefetch(distortion_out.data + row, 1);
-        __builtin_prefetch(medians_out.data + row, 1);
-        __builtin_prefetch(medians_at_out.data + row, 1);
-        for (int i = 0; i < 3; ++i) __builtin_prefetch(normals_out.data + row * 3 + 16 * i, 1);
-    }
-"""
-
 _TILE = f"""
 #if !defined(__CUDACC__)
 {LOCATE_TILE}{VECTOR}{IMAGES}{BATCH_STATE}
@@ -316,7 +299,16 @@ _TILE = f"""
         median_at_[k] = (I)-1;
     }}
     const int channels_out = image_out.shape[1];
-{_FETCH}
+    fetch_image(image_out.data, channels_out);
+    fetch_image(alphas_out.data, 1);
+    fetch_image(transmittance_out.data, 1);
+    if (geometry) {{
+        fetch_image(depths_out.data, 1);
+        fetch_image(normals_out.data, 3);
+        fetch_image(distortion_out.data, 1);
+        fetch_image(medians_out.data, 1);
+        fetch_image((float*)medians_at_out.data, 1);
+    }}
     const int end = offsets.data[tile + 1];
     int at = begin;
     while (at < end && alive) {{
