@@ -62,24 +62,7 @@ LOCATE_PIXEL = f"""
 """
 """Snippet: `index` -> the same, and pixel x, y, its number, and whether it lies inside the image."""
 
-TILE_LANES = f"""
-    typedef float F __attribute__((ext_vector_type(16)));
-    typedef int I __attribute__((ext_vector_type(16)));
-    typedef bool M __attribute__((ext_vector_type(16)));
-    const F column = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}};
-    const F row = {{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
-    const I lane_number = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
-    const F inside = (F)1.0f, outside = (F)-1.0f, zero = (F)0.0f;
-    auto fma = [](F a, F b, F c) {{ return __builtin_elementwise_fma(a, b, c); }};
-    auto bits = [](I mask) {{
-        M m = __builtin_convertvector(mask, M);
-        unsigned short b;
-        __builtin_memcpy(&b, &m, 2);
-        return (unsigned)b;
-    }};
-    const int x_end = width - tile_x < {TILE} ? width - tile_x : {TILE};
-    const int y_end = height - tile_y < {TILE} ? height - tile_y : {TILE};
-
+ARITHMETIC = f"""
     // Read through volatile memory so that they stay in registers: as literals the compiler would fetch each
     // anew at every block, through a 64-bit address. The polynomials are those of EXP2.
 #if defined(__AVX512DQ__)
@@ -119,7 +102,37 @@ TILE_LANES = f"""
         return raw;
 #endif
     }};
+    // 1 / v: a 14-bit estimate and one step of Newton's method, to about 1 ulp.
+    auto reciprocal = [&](F v) {{
+#if defined(__AVX512F__)
+        const F y = (F)__builtin_ia32_rcp14ps512_mask(v, zero, (unsigned short)-1);
+        return fma(y, fma(-v, y, one), y);
+#else
+        return one / v;
+#endif
+    }};
+"""
+"""CPU snippet, after F, I, zero and fma: constants, exp2_ and reciprocal."""
 
+TILE_LANES = f"""
+    typedef float F __attribute__((ext_vector_type(16)));
+    typedef int I __attribute__((ext_vector_type(16)));
+    typedef bool M __attribute__((ext_vector_type(16)));
+    const F column = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}};
+    const F row = {{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
+    const I lane_number = {{0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}};
+    const F inside = (F)1.0f, outside = (F)-1.0f, zero = (F)0.0f;
+    auto fma = [](F a, F b, F c) {{ return __builtin_elementwise_fma(a, b, c); }};
+    auto bits = [](I mask) {{
+        M m = __builtin_convertvector(mask, M);
+        unsigned short b;
+        __builtin_memcpy(&b, &m, 2);
+        return (unsigned)b;
+    }};
+    const int x_end = width - tile_x < {TILE} ? width - tile_x : {TILE};
+    const int y_end = height - tile_y < {TILE} ? height - tile_y : {TILE};
+
+{ARITHMETIC}
     // Transmittance of the pixels of 16 blocks, with the sign as a flag: T > 0 goes on, T < 0 has stopped
     // at |T|.
     F T[16], X[16], Y[16];

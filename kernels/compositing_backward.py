@@ -160,7 +160,7 @@ _TILE = f"""
                 const F behind = fma(-w, q, R[k]);
                 R[k] = behind;
                 // alpha times the gradient at alpha, with T (1 - alpha) = next.
-                const F g_p = (blend & (raw <= alpha_max)) ? w * (q - behind / next) : zero;
+                const F g_p = (blend & (raw <= alpha_max)) ? w * fma(-behind, reciprocal(next), q) : zero;
                 const F g_u = g_p * u, g_v = g_p * v;
                 sum_p += g_p;
                 sum_u += g_u;

@@ -67,15 +67,6 @@ VECTOR = f"""
     auto min_ = [](F v, F w) {{ return v < w ? v : w; }};
     auto max_ = [](F v, F w) {{ return v > w ? v : w; }};
     auto abs_ = [](F v) {{ return __builtin_elementwise_abs(v); }};
-#if defined(__AVX512F__)
-    // A 14-bit estimate and one step of Newton's method, to about 1 ulp.
-    auto reciprocal = [&](F v) {{
-        const F y = (F)__builtin_ia32_rcp14ps512_mask(v, zero, (unsigned short)-1);
-        return fma(y, fma(-v, y, one), y);
-    }};
-#else
-    auto reciprocal = [&](F v) {{ return one / v; }};
-#endif
     const F nearest = (F){NEAREST!r}f, log2_e = (F){LOG2_E!r}f, one_half = (F)0.5f;
     const int SIZE = 16;
 """

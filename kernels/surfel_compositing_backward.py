@@ -121,7 +121,7 @@ _GRADIENT = f"""
             const F behind = fma(-w, q, R[k]);
             R[k] = behind;
             // alpha times the gradient at alpha, with T (1 - alpha) = next.
-            const F g_log = {2 * LN2!r}f * w * (q - behind * reciprocal(next));
+            const F g_log = {2 * LN2!r}f * w * fma(-behind, reciprocal(next), q);
             const F g_p = (blend & (raw <= alpha_max)) ? g_log : zero;
 """
 """Snippet: weight and depth of block k -> gradient g_z at z and g_p, 2 ln 2 times that at p."""

@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from gdpro_sim import device  # noqa: F401  (quiets Warp before it starts)
+from gdpro_sim.kernels.compositing import ARITHMETIC
 from tests.benchmarks.machine import VECTOR_FLAGS, machine
 
 wp.set_module_options(
@@ -33,13 +34,14 @@ wp.set_module_options(
 GAUSSIANS, ROW = 32, 16
 """Gaussians of a list and floats of each: 2 KB."""
 
-_LANES = """
+_LANES = f"""
     typedef float F __attribute__((ext_vector_type(16)));
     typedef int I __attribute__((ext_vector_type(16)));
-    const F column = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
-    const F row = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+    const F column = {{0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3}};
+    const F row = {{0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}};
     const F block_x = 4.0f * column, block_y = 4.0f * row, zero = (F)0.0f;
-    auto fma = [](F a, F b, F c) { return __builtin_elementwise_fma(a, b, c); };
+    auto fma = [](F a, F b, F c) {{ return __builtin_elementwise_fma(a, b, c); }};
+{ARITHMETIC}
     float ub[16] __attribute__((aligned(64))), vb[16] __attribute__((aligned(64)));
     F T[16], c0[16], c1[16], c2[16], c3[16];
 """
@@ -57,23 +59,11 @@ _GAUSSIAN = f"""
 _STEP = """
                 const F u = u_lane + ub[k], v = v_lane + vb[k];
                 const F p = fma(-v, v, fma(-u, u, (F)l));
-                const F n = p + 12582912.0f;
-                const F f = p - (n - 12582912.0f);
-                F e = fma(f, (F)1.3264727e-3f, (F)9.671513e-3f);
-                e = fma(e, f, (F)5.5507336e-2f);
-                e = fma(e, f, (F)2.4022242e-1f);
-                e = fma(e, f, (F)6.9314700e-1f);
-                e = fma(e, f, (F)1.0f);
-                I exponent, mantissa;
-                __builtin_memcpy(&exponent, &n, 64);
-                __builtin_memcpy(&mantissa, &e, 64);
-                mantissa += exponent << 23;
-                F raw;
-                __builtin_memcpy(&raw, &mantissa, 64);
-                const F alpha = __builtin_elementwise_min(raw, (F)0.99f);
+                const F raw = exp2_(p);
+                const F alpha = raw < alpha_max ? raw : alpha_max;
                 const F t = T[k];
                 const F next = fma(-alpha, t, t);
-                const I blend = (p >= -7.994353f) & (next > 1.0e-4f);
+                const I blend = (p >= cutoff) & (next > transmittance_min);
                 const F w = blend ? alpha * t : zero;
                 T[k] = blend ? next : t;
 """
@@ -122,8 +112,7 @@ _BACKWARD = f"""
                 const F q = fma((F)r0, c0[k], fma((F)r1, c1[k], fma((F)r2, c2[k], r3 * c3[k])));
                 const F behind = fma(-w, q, R[k]);
                 R[k] = behind;
-                const F g_alpha = fma(t, q, -behind / (1.0f - alpha));
-                const F g_p = (blend & (raw <= 0.99f)) ? g_alpha * raw : zero;
+                const F g_p = (blend & (raw <= alpha_max)) ? w * fma(-behind, reciprocal(next), q) : zero;
                 const F g_u = g_p * u, g_v = g_p * v;
                 s0 += g_p;
                 s1 += g_u;
