@@ -169,8 +169,8 @@ class Crew:
         self._rests = _rests(PATIENCE)
         self._calls: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._busy = threading.Lock()
-        self._give = _record(kernels.give, [self._job, 0, 0, 0, 0, self._rests])
-        self._wait = _record(kernels.wait, [self._job, self._rests])
+        self._give = _record(kernels.give, [self._job, 0, 0, 0, 0])
+        self._join = _record(kernels.join, [self._job, self._rests])
         for number in range(1, threads):
             name = f"gdpro_{number}"
             threading.Thread(
@@ -184,21 +184,25 @@ class Crew:
             alone.launch()
             return
         try:
-            for _ in range(min(self.threads, plan.count) - 1 - int(self._view[kernels.AWAKE])):
-                self._calls.put(True)
             told = self._give.arguments
             told.function, told.bounds, told.arguments, told.count = plan.job
             self._give.launch()
+            # Whoever falls asleep after this look has seen the job first.
+            for _ in range(min(self.threads, plan.count) - 1 - int(self._view[kernels.AWAKE])):
+                self._calls.put(True)
         finally:  # Ctrl-C may come before this line: the pieces are at work all the same
             self._finish()
             self._busy.release()
 
     def _finish(self) -> None:
+        """Take part, until all pieces given out are done."""
         interrupted: BaseException | None = None
-        while int(self._view[kernels.DONE]) != int(self._view[kernels.COUNT]):
+        while True:
             try:
+                self._join.launch()
+                if int(self._view[kernels.DONE]) == int(self._view[kernels.COUNT]):
+                    break
                 time.sleep(NAP)
-                self._wait.launch()
             except BaseException as error:  # they write to the caller's memory until they end
                 interrupted = error
         if interrupted is not None:

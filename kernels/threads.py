@@ -74,7 +74,7 @@ _JOB = """
             rest();
         }}
         __atomic_fetch_sub(awake, 1, __ATOMIC_SEQ_CST);
-        // Whoever gave out a job since saw this thread awake, or is seen here.
+        // A job given out before this is seen here; who gives out a later one sees this thread asleep.
         if (!waits()) return;
         __atomic_fetch_add(awake, 1, __ATOMIC_SEQ_CST);
     }}
@@ -96,46 +96,33 @@ def serve(job: wp.array[wp.uint64], rests: int):
     __atomic_store_n(finished, 0, __ATOMIC_RELAXED);
     const unsigned long long number = (*ticket >> 32) + 1;
     __atomic_store_n(ticket, (number << 32) | (unsigned)count, __ATOMIC_SEQ_CST);
-    work();
-    wait(rests);
 #endif
 """)
 def give_job(
-    job: wp.array[wp.uint64],
-    function: wp.uint64,
-    bounds: wp.uint64,
-    arguments: wp.uint64,
-    count: int,
-    rests: int,
+    job: wp.array[wp.uint64], function: wp.uint64, bounds: wp.uint64, arguments: wp.uint64, count: int
 ): ...
 
 
 @wp.kernel
-def give(
-    job: wp.array[wp.uint64],
-    function: wp.uint64,
-    bounds: wp.uint64,
-    arguments: wp.uint64,
-    count: int,
-    rests: int,
-):
-    """Give out a job and take part in it; then wait for the others' pieces, for at most `rests` pauses."""
-    give_job(job, function, bounds, arguments, count, rests)
+def give(job: wp.array[wp.uint64], function: wp.uint64, bounds: wp.uint64, arguments: wp.uint64, count: int):
+    """Give out a job: whoever is awake begins. Only then look how many are."""
+    give_job(job, function, bounds, arguments, count)
 
 
 @wp.func_native(f"""
 #if !defined(__CUDACC__)
     {_JOB}
+    work();
     wait(rests);
 #endif
 """)
-def await_job(job: wp.array[wp.uint64], rests: int): ...
+def join_job(job: wp.array[wp.uint64], rests: int): ...
 
 
 @wp.kernel
-def wait(job: wp.array[wp.uint64], rests: int):
-    """Wait until every piece is done, or for `rests` pauses."""
-    await_job(job, rests)
+def join(job: wp.array[wp.uint64], rests: int):
+    """Take pieces until none is left; then wait for the others' pieces, for at most `rests` pauses."""
+    join_job(job, rests)
 
 
 @wp.func_native("""

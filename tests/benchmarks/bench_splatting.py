@@ -7,8 +7,7 @@ Scene: N Gaussians on a bumpy sphere that fills the frame, tangential scale sqrt
 factor, normal scale 0.3 of it, opacity sigmoid(N(0.8, 1.5)). "fwd" is an image of tensors that need no
 gradient; "fwd+bwd" is an image, loss = sum(image * fixed weights), and its gradients at means, quats, scales,
 opacities and colours through autograd. Wall times are medians; CPU times (all threads together) are minima,
-since they grow with what else runs on a shared machine. Torch's own operators (the loss) keep to one thread:
-its waiting workers would take the cores from ours.
+since they grow with what else runs on a shared machine. Torch has as many threads for the loss.
 """
 
 from __future__ import annotations
