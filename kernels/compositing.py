@@ -41,7 +41,8 @@ wp.set_module_options(
 ALPHA_MAX = wp.constant(0.99)
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
 LN2 = wp.constant(0.6931471805599453)
-BATCH_SIZE = 32
+BATCH_FORWARD, BATCH_BACKWARD = 32, 16
+"""Entries of a list looked at together: BATCH_SIZE in the text, at most 32."""
 
 LOCATE_TILE = f"""
     const int tiles_x = (width + {TILE - 1}) / {TILE}, tiles_y = (height + {TILE - 1}) / {TILE};
@@ -168,8 +169,8 @@ PASS = """
 """CPU snippet: transmittance t behind."""
 
 BATCH_STATE = f"""
-    float rows[{BATCH_SIZE}][{RECORD}] __attribute__((aligned(64)));
-    float u0[{BATCH_SIZE}] __attribute__((aligned(64))), v0[{BATCH_SIZE}] __attribute__((aligned(64)));
+    float rows[BATCH_SIZE][{RECORD}] __attribute__((aligned(64)));
+    float u0[BATCH_SIZE] __attribute__((aligned(64))), v0[BATCH_SIZE] __attribute__((aligned(64)));
     auto transpose = [](F* rows) {{{TRANSPOSE}
     }};
     const float* const record = records.data;
@@ -185,7 +186,7 @@ BATCH = f"""
         // the tile's first pixel from the mean, in pixels and whitened, and the blocks each can reach:
         // those whose centre lies in the box grown by the block, and within `reach` of the mean in
         // standard deviations.
-        const int held = end - at < {BATCH_SIZE} ? end - at : {BATCH_SIZE};
+        const int held = end - at < BATCH_SIZE ? end - at : BATCH_SIZE;
         for (int first = 0; first < held; first += 16) {{
             F fields[{RECORD}];
             for (int j = 0; j < 16; ++j) {{
@@ -196,8 +197,8 @@ BATCH = f"""
                     __builtin_memcpy(rows[first + j] + {CHANNELS},
                         colour + (size_t)id[at + i] * channel_stride, 16);
                 }}
-                if (i + {BATCH_SIZE} < end - at) {{
-                    __builtin_prefetch(record + (size_t)id[at + i + {BATCH_SIZE}] * {RECORD});
+                if (i + BATCH_SIZE < end - at) {{
+                    __builtin_prefetch(record + (size_t)id[at + i + BATCH_SIZE] * {RECORD});
                 }}
             }}
             transpose(fields);
@@ -245,6 +246,7 @@ _BATCH = (
 _TILE = f"""
 #if !defined(__CUDACC__)
 {LOCATE_TILE}{TILE_LANES}{IMAGES}
+    const int BATCH_SIZE = {BATCH_FORWARD};
 {BATCH_STATE}
     F c0[16], c1[16], c2[16], c3[16];
     for (int k = 0; k < 16; ++k) c0[k] = c1[k] = c2[k] = c3[k] = zero;

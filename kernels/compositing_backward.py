@@ -16,7 +16,7 @@ import warp as wp
 from gdpro_sim.kernels.compositing import (
     ALPHA_MAX,
     BATCH,
-    BATCH_SIZE,
+    BATCH_BACKWARD,
     BATCH_STATE,
     EXP2,
     LN2,
@@ -133,6 +133,7 @@ _TILE = f"""
         }}
         R[k] = fma(-left[k], on_alpha[k], R[k]);
     }}
+    const int BATCH_SIZE = {BATCH_BACKWARD};
 {BATCH_STATE}
     const int end = stops.data[tile];
     const int WIDTH = {RECORD};
@@ -140,7 +141,7 @@ _TILE = f"""
     const float s = {2 * LN2!r}f;
     const F factors = {{s, s, s, s, s, s, s, s, 1, 1, 1, 1, s, s, s, s}};
     for (int at = begin; at < end && alive;) {{
-        int masks[{BATCH_SIZE}] __attribute__((aligned(64)));
+        int masks[BATCH_SIZE] __attribute__((aligned(64)));
         unsigned own = 0;
 {_BATCH}
         for (int i = 0; i < held; ++i) {{

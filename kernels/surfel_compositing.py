@@ -19,7 +19,7 @@ import warp as wp
 
 from gdpro_sim.kernels.compositing import (
     ALPHA_MAX,
-    BATCH_SIZE,
+    BATCH_FORWARD,
     EXP2,
     LN2,
     LOCATE_PIXEL,
@@ -97,10 +97,10 @@ EXP = f"""
 """Snippet for one pixel: p -> raw = exp2(p)."""
 
 BATCH_STATE = f"""
-    float rows[{BATCH_SIZE}][{RECORD}] __attribute__((aligned(64)));
-    float u0[{BATCH_SIZE}] __attribute__((aligned(64))), v0[{BATCH_SIZE}] __attribute__((aligned(64)));
-    float w0[{BATCH_SIZE}] __attribute__((aligned(64)));
-    float mx0[{BATCH_SIZE}] __attribute__((aligned(64))), my0[{BATCH_SIZE}] __attribute__((aligned(64)));
+    float rows[BATCH_SIZE][{RECORD}] __attribute__((aligned(64)));
+    float u0[BATCH_SIZE] __attribute__((aligned(64))), v0[BATCH_SIZE] __attribute__((aligned(64)));
+    float w0[BATCH_SIZE] __attribute__((aligned(64)));
+    float mx0[BATCH_SIZE] __attribute__((aligned(64))), my0[BATCH_SIZE] __attribute__((aligned(64)));
     auto transpose = [](F* rows) {{{TRANSPOSE}
     }};
     const float* const record = records.data;
@@ -116,7 +116,7 @@ BATCH = f"""
         // and the offset from the mean at the tile's first pixel, and the blocks each can reach. Those touch
         // its box, and its low-pass or its disc: within a block (U . e, V . e) varies by `reach` and
         // W by `turn` at most.
-        const int held = end - at < {BATCH_SIZE} ? end - at : {BATCH_SIZE};
+        const int held = end - at < BATCH_SIZE ? end - at : BATCH_SIZE;
         for (int first = 0; first < held; first += 16) {{
             F fields[16];
             for (int j = 0; j < 16; ++j) {{
@@ -128,8 +128,8 @@ BATCH = f"""
                     __builtin_memcpy(rows[first + j] + {CHANNELS}, colour + (size_t)id[at
                         + i] * channel_stride, 12);
                 }}
-                if (i + {BATCH_SIZE} < end - at) {{
-                    const float* const next = record + (size_t)id[at + i + {BATCH_SIZE}] * {RECORD};
+                if (i + BATCH_SIZE < end - at) {{
+                    const float* const next = record + (size_t)id[at + i + BATCH_SIZE] * {RECORD};
                     __builtin_prefetch(next);
                     __builtin_prefetch(next + 16);
                 }}
@@ -282,7 +282,9 @@ _BATCH = (
 
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{VECTOR}{IMAGES}{BATCH_STATE}
+{LOCATE_TILE}{VECTOR}{IMAGES}
+    const int BATCH_SIZE = {BATCH_FORWARD};
+{BATCH_STATE}
     F {", ".join(f"{name}_[16]" for name in _SUMS)};
     I median_at_[16];
     for (int k = 0; k < 16; ++k) {{

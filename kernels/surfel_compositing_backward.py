@@ -15,7 +15,7 @@ sums over pixels of the absolute gradient at the mean.
 
 import warp as wp
 
-from gdpro_sim.kernels.compositing import BATCH_SIZE, LN2, LOCATE_PIXEL, LOCATE_TILE
+from gdpro_sim.kernels.compositing import BATCH_BACKWARD, LN2, LOCATE_PIXEL, LOCATE_TILE
 from gdpro_sim.kernels.compositing_backward import AGAIN, SPILL, STILL_ALIVE, WARP_SUMS
 from gdpro_sim.kernels.images import IMAGES
 from gdpro_sim.kernels.lanes import CPU_FLAGS, SUM_LANES
@@ -206,7 +206,9 @@ _BATCH = (
 
 _TILE = f"""
 #if !defined(__CUDACC__)
-{LOCATE_TILE}{VECTOR}{IMAGES}{SUM_LANES}{SLAB_ROWS}{BATCH_STATE}
+{LOCATE_TILE}{VECTOR}{IMAGES}{SUM_LANES}{SLAB_ROWS}
+    const int BATCH_SIZE = {BATCH_BACKWARD};
+{BATCH_STATE}
     const int channels_out = image.shape[1];
 {_STATE}
     F least[16];
@@ -269,8 +271,8 @@ _TILE = f"""
     const int end = stops.data[tile];
     const int WIDTH = {RECORD};
     for (int at = begin; at < end && alive;) {{
-        int masks[{BATCH_SIZE}] __attribute__((aligned(64))),
-            blurs[{BATCH_SIZE}] __attribute__((aligned(64)));
+        int masks[BATCH_SIZE] __attribute__((aligned(64))),
+            blurs[BATCH_SIZE] __attribute__((aligned(64)));
         unsigned own = 0;
 {_BATCH}
         for (int i = 0; i < held; ++i) {{
