@@ -215,11 +215,8 @@ def launch_ranges(
         _crew_of().run(Plan(Command(recorded, []), list(itertools.pairwise(bounds)), varying))
 
 
-DESCRIPTOR: Any = type(wp.zeros(1, dtype=int, device="cpu").__ctype__())
-"""Warp's structure that tells a kernel where an array lies."""
-
-_PLAIN = int, float, DESCRIPTOR
-"""Arguments of a kernel that need no packing."""
+_PLAIN = int, float, type(wp.zeros(1, dtype=int, device="cpu").__ctype__())
+"""Arguments of a kernel that need no packing: numbers, and descriptors of arrays."""
 
 
 class Launches:

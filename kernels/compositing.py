@@ -65,7 +65,7 @@ LOCATE_PIXEL = f"""
 
 ARITHMETIC = f"""
     // Read through volatile memory so that they stay in registers: as literals the compiler would fetch each
-    // anew at every block, through a 64-bit address. The polynomials are those of EXP2.
+    // anew at every block, through a 64-bit address. The polynomials are those of exp2_.
 #if defined(__AVX512DQ__)
     const volatile float literals[] = {{0.0f, 1.8671303e-3f, 9.0170298e-3f, 5.5799913e-2f, 2.4016444e-1f,
         6.9315130e-1f, 1.0f, {float(ALPHA_MAX)!r}f, {float(LOG2_CUTOFF)!r}f, {float(TRANSMITTANCE_MIN)!r}f}};

@@ -1,8 +1,12 @@
 """Orders by depth on a CPU: a radix sort of (key, number) pairs, stable, by 11 bits of the key at a time.
 
 Keys are non-negative floats, infinity included, whose bits are in the order of their values. One index sorts
-all Gaussians of a camera (`sort_cameras`), or each of `parts` ranges of them counts its digits and then moves
-its pairs (`count_digits`, `move_pairs`), once for each digit. Both give the same order.
+them all (`sort_alone`), or each of `parts` ranges of them counts its digits and then moves its pairs
+(`count_digits`, `move_pairs`), once for each digit. Both give the same order.
+
+    keys       [N]
+    order_out  [N] numbers, sorted in place
+    pairs_out  [2, N] scratch
 """
 
 import warp as wp
@@ -24,10 +28,10 @@ BUCKETS = 2048
 _READ = f"""
     typedef unsigned long long Pair;
     auto digit = [](Pair pair, int number) {{ return (int)(pair >> (32 + 11 * number)) & {BUCKETS - 1}; }};
-    const unsigned* const key = (const unsigned*)keys.data + (size_t)camera * keys.shape[1];
-    int* const place = order_out.data + (size_t)camera * order_out.shape[1];
-    Pair* const scratch[2] = {{(Pair*)pairs_out.data + (size_t)camera * pairs_out.shape[1],
-        (Pair*)pairs_out.data + (size_t)(camera + pairs_out.shape[0] / 2) * pairs_out.shape[1]}};
+    const int count = keys.shape[0];
+    const unsigned* const key = (const unsigned*)keys.data;
+    int* const place = order_out.data;
+    Pair* const scratch[2] = {{(Pair*)pairs_out.data, (Pair*)pairs_out.data + count}};
     // Digit 0 is read from keys and order and the last written to the order: pairs lie between.
     auto read = [&](int number, int i) {{
         return number == 0 ? (Pair)key[i] << 32 | (unsigned)place[i] : scratch[(number - 1) & 1][i];
@@ -41,7 +45,7 @@ _READ = f"""
         }}
     }};
 """
-"""Snippet: `camera`, arrays -> digit, read, move."""
+"""Snippet: arrays -> count, digit, read, move."""
 
 _RANGE = """
     const int begin = (int)((long long)count * part / parts),
@@ -51,8 +55,7 @@ _RANGE = """
 
 @wp.func_native(f"""
 {_READ}
-    int counts[{DIGITS}][{BUCKETS}];
-    for (int i = 0; i < {DIGITS * BUCKETS}; ++i) counts[0][i] = 0;
+    int counts[{DIGITS}][{BUCKETS}] = {{}};
     for (int i = 0; i < count; ++i) {{
         const Pair pair = read(0, i);
         for (int number = 0; number < {DIGITS}; ++number) ++counts[number][digit(pair, number)];
@@ -67,27 +70,13 @@ _RANGE = """
         move(number, 0, count, counts[number]);
     }}
 """)
-def sort_camera(
-    camera: int,
-    count: int,
-    keys: wp.array2d[float],
-    order_out: wp.array2d[int],
-    pairs_out: wp.array2d[wp.int64],
-): ...
+def sort_all(keys: wp.array[float], order_out: wp.array[int], pairs_out: wp.array2d[wp.int64]): ...
 
 
 @wp.kernel
-def sort_cameras(
-    start: int,
-    # In:
-    count: int,
-    keys: wp.array2d[float],
-    # Out:
-    order_out: wp.array2d[int],
-    pairs_out: wp.array2d[wp.int64],
-):
-    """Sort the `count` numbers order_out[camera] by keys[camera]; `pairs_out` [2 C, count] is scratch."""
-    sort_camera(start + wp.tid(), count, keys, order_out, pairs_out)
+def sort_alone(start: int, keys: wp.array[float], order_out: wp.array[int], pairs_out: wp.array2d[wp.int64]):
+    """Sort all numbers; one index does it."""
+    sort_all(keys, order_out, pairs_out)
 
 
 @wp.func_native(f"""
@@ -100,10 +89,8 @@ def count_part(
     part: int,
     parts: int,
     number: int,
-    camera: int,
-    count: int,
-    keys: wp.array2d[float],
-    order_out: wp.array2d[int],
+    keys: wp.array[float],
+    order_out: wp.array[int],
     pairs_out: wp.array2d[wp.int64],
     counts_out: wp.array2d[int],
 ): ...
@@ -115,16 +102,14 @@ def count_digits(
     # In:
     parts: int,
     number: int,
-    camera: int,
-    count: int,
-    keys: wp.array2d[float],
-    order: wp.array2d[int],
+    keys: wp.array[float],
+    order: wp.array[int],
     pairs: wp.array2d[wp.int64],
     # Out:
     counts_out: wp.array2d[int],
 ):
     """How often each value of digit `number` occurs in one part: counts_out [parts, BUCKETS]."""
-    count_part(start + wp.tid(), parts, number, camera, count, keys, order, pairs, counts_out)
+    count_part(start + wp.tid(), parts, number, keys, order, pairs, counts_out)
 
 
 @wp.func_native(f"""
@@ -145,12 +130,10 @@ def move_part(
     part: int,
     parts: int,
     number: int,
-    camera: int,
-    count: int,
-    keys: wp.array2d[float],
-    counts: wp.array2d[int],
-    order_out: wp.array2d[int],
+    keys: wp.array[float],
+    order_out: wp.array[int],
     pairs_out: wp.array2d[wp.int64],
+    counts: wp.array2d[int],
 ): ...
 
 
@@ -160,13 +143,12 @@ def move_pairs(
     # In:
     parts: int,
     number: int,
-    camera: int,
-    count: int,
-    keys: wp.array2d[float],
-    counts: wp.array2d[int],
+    keys: wp.array[float],
     # Out:
-    order_out: wp.array2d[int],
+    order_out: wp.array[int],
     pairs_out: wp.array2d[wp.int64],
+    # In:
+    counts: wp.array2d[int],
 ):
     """Move the pairs of one part to where digit `number` puts them."""
-    move_part(start + wp.tid(), parts, number, camera, count, keys, counts, order_out, pairs_out)
+    move_part(start + wp.tid(), parts, number, keys, order_out, pairs_out, counts)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from gdpro_sim.device import launch_chunked, thread_count
+from gdpro_sim.device import launch_ranges, thread_count
 from gdpro_sim.kernels import sorting as kernels
 from gdpro_sim.splatting import buffers
 from gdpro_sim.splatting.arrays import array
@@ -38,23 +38,23 @@ def sort_by_depth(keys: torch.Tensor, order: torch.Tensor, count: int) -> None:
         for camera in range(cameras):
             sort_pairs(keys[camera], order[camera], count)
         return
-    pairs = buffers.empty((2 * cameras, count), torch.int64, keys.device)
-    key_array, outputs = array(keys, wp.float32), [array(order, wp.int32), array(pairs, wp.int64)]
-    parts = min(thread_count(), count // PART)
-    if parts < 2:
-        launch_chunked(kernels.sort_cameras, cameras, [count, key_array], outputs, device="cpu", minimum=1)
-        return
+    pairs = buffers.empty((2, count), torch.int64, keys.device)
+    parts = max(1, min(thread_count(), count // PART))
     counts = torch.empty((parts, kernels.BUCKETS), dtype=torch.int32)
     counts_array = array(counts, wp.int32)
     for camera in range(cameras):
+        arrays = [
+            array(keys[camera], wp.float32),
+            array(order[camera], wp.int32),
+            array(pairs, wp.int64),
+        ]
+        if parts == 1:
+            launch_ranges(kernels.sort_alone, [0, 1], arrays)
+            continue
         for number in range(kernels.DIGITS):
-            inputs = [parts, number, camera, count, key_array]
-            launch_chunked(
-                kernels.count_digits, parts, [*inputs, *outputs], [counts_array], device="cpu", minimum=1
-            )
-            launch_chunked(
-                kernels.move_pairs, parts, [*inputs, counts_array], outputs, device="cpu", minimum=1
-            )
+            given = [parts, number, *arrays, counts_array]
+            launch_ranges(kernels.count_digits, range(parts + 1), given)
+            launch_ranges(kernels.move_pairs, range(parts + 1), given)
 
 
 def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int = 32) -> None:
